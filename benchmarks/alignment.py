@@ -73,10 +73,10 @@ class World:
 
 
 def make_world(shoppers: int, rays: int) -> World:
+    from nerg_mi.environment.environment import load_field_geometry
     from nerg_mi.scenes.store import twin
     from nerg_mi.scenes.store.layout import build_store
     from nerg_mi.scenes.store.shoppers import simulate_shoppers
-    from nerg_mi.train.geometry import load_field_geometry
     from nerg_mi.workflows.base import select_backend
 
     ns, folder = select_backend("llvm_ad_rgb"), Path(twin.__file__).parent
@@ -234,8 +234,8 @@ def cells(row: dict) -> list[str]:
 def list_hidden(world: World, folder: Path) -> Iterator[tuple[str, SceneTraces | None, Rays]]:
     """Names, traces and recordings. Without traces, the surface is what the gaze of other participants meets."""
     import generated_places
+    from nerg_mi.environment.environment import load_scene_geometry
     from nerg_mi.rays.readers.registry import read_rays
-    from nerg_mi.train.geometry import load_scene_geometry
 
     yield "demo store", world.traces, world.rays
     for make in generated_places.PLACES:

@@ -31,9 +31,9 @@ def main(argv=None) -> None:
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
+    from nerg_mi.environment.environment import load_field_geometry, load_volume_geometry
     from nerg_mi.fields.mlp import namespace
     from nerg_mi.formats.fields import load_gaze
-    from nerg_mi.train.geometry import load_field_geometry, load_volume_geometry
     from nerg_mi.transport.geometry import SceneGeometry, default_march_settings
     from nerg_mi.transport.observer import MAX_DIRECTIONS as COUNT
     from nerg_mi.transport.observer import ObserverSettings

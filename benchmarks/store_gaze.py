@@ -42,6 +42,7 @@ def main(argv=None) -> None:
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
+    from nerg_mi.environment.environment import load_field_geometry
     from nerg_mi.evaluation.baselines import make_tuned_baselines
     from nerg_mi.evaluation.gaze import EPS, FieldDensity, compute_map_scores
     from nerg_mi.fields.mlp import namespace
@@ -52,7 +53,6 @@ def main(argv=None) -> None:
     from nerg_mi.scenes import store
     from nerg_mi.scenes.store.attention_law import AttentionLaw
     from nerg_mi.train.gaze_data import find_hit_points
-    from nerg_mi.train.geometry import load_field_geometry
 
     local = Path(store.__file__).resolve().parent
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

@@ -38,7 +38,6 @@ if TYPE_CHECKING:
         write_scene,
     )
     from .api.arrays import Camera
-    from .api.contents import DensityGrid
     from .api.evaluation import evaluate_gaze, evaluate_radiance, folds, next_look, study
     from .api.gaze import load_gaze
     from .api.query import attention, observe, trace
@@ -46,6 +45,7 @@ if TYPE_CHECKING:
     from .api.render import render
     from .api.scene import Scene, make_scene
     from .api.training import train_gaze, train_prior, train_radiance
+    from .environment.contents import DensityGrid
     from .environment.trained import load_field
     from .errors import NergError
     from .rays.dataset import load_rays
@@ -60,7 +60,7 @@ __version__ = "0.1.0"
 
 _MODULES = {
     "Camera": "nerg_mi.api.arrays",
-    "DensityGrid": "nerg_mi.api.contents",
+    "DensityGrid": "nerg_mi.environment.contents",
     "NergError": "nerg_mi.errors",
     "Rays": "nerg_mi.rays.rays",
     "Scene": "nerg_mi.api.scene",

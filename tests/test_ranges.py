@@ -20,6 +20,7 @@ import nerg_mi.rays.readers
 import nerg_mi.workflows
 from nerg_mi import errors, properties
 from nerg_mi.cli.building import build_command
+from nerg_mi.environment.environment import load_scene_geometry, load_volume_geometry
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation.metrics import FieldRenderer
 from nerg_mi.formats.surfaces import write_volume
@@ -38,7 +39,6 @@ from nerg_mi.ranges import (
 )
 from nerg_mi.rays.readers.registry import collect_shared_options
 from nerg_mi.train import gaze_settings, radiance_settings
-from nerg_mi.train.geometry import load_scene_geometry, load_volume_geometry
 from nerg_mi.workflows import rays
 from nerg_mi.workflows.base import Command
 from nerg_mi.workflows.gaze_commands import GazeEvaluationOptions

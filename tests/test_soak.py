@@ -124,12 +124,12 @@ def gaze_steps() -> Callable[[int], None]:
     import drjit as dr
     import drjit.llvm.ad as ns
 
+    from nerg_mi.environment.environment import no_geometry
     from nerg_mi.fields.encoding import HashGridConfig
     from nerg_mi.fields.gaze_product import GazeConfig
     from nerg_mi.train.gaze_data import make_targets_from_rays
     from nerg_mi.train.gaze_product import ProductTrainer
     from nerg_mi.train.gaze_settings import GazeSettings, ProbeSettings
-    from nerg_mi.train.geometry import no_geometry
 
     rays = tiny.simulate_gaze()
     place = no_geometry(rays.origin)

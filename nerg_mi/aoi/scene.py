@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from nerg_mi.environment import environment as geometry
+from nerg_mi.environment.environment import Environment
 from nerg_mi.errors import NergError, sanitize, translate_mitsuba_errors
 from nerg_mi.files.safe_read import read_json
 from nerg_mi.files.tables import unescape_formula
@@ -38,9 +40,7 @@ from nerg_mi.ranges import COORDINATES
 from nerg_mi.rays.readers.columns import open_named_table
 from nerg_mi.rendering.bands import is_nerg
 from nerg_mi.rendering.scene import load_scene
-from nerg_mi.train import geometry
 from nerg_mi.train.gaze_data import SURFACE_OPACITY
-from nerg_mi.train.geometry import TrainingGeometry
 from nerg_mi.train.geometry_files import load_training_geometry, read_training_alignment
 from nerg_mi.transport.extrapolation import describe_extrapolation
 from nerg_mi.transport.geometry import SceneGeometry, default_march_settings, shape_corners, trace_depth
@@ -217,7 +217,7 @@ def load_gaze_scene(
 
 
 def _gaze_scene_from_training(
-    training_geometry: TrainingGeometry, gaze: GazeFieldInstance | None, align: Similarity
+    training_geometry: Environment, gaze: GazeFieldInstance | None, align: Similarity
 ) -> GazeScene:
     medium = training_geometry.medium
     geometry = medium if isinstance(medium, SceneGeometry) or medium is None else SceneGeometry(medium)

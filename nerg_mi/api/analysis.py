@@ -30,7 +30,7 @@ from .arguments import check_output, resolve_file
 from .calls import Progress, report_progress, show_figure
 from .gaze import TrainedGazeField, list_inputs
 from .objects import as_file, as_scene_file, build_options, copy_from_session
-from .scene import Environment, Scene, make_scene
+from .scene import AnyEnvironment, Scene, make_scene
 from .session import display_name, is_object, session_folder
 
 if TYPE_CHECKING:
@@ -54,8 +54,8 @@ def statistics(
     Parameters
     ----------
     inputs : object or sequence of these
-        Recordings (`Rays`, a file or a dataset), an environment (`nerg_mi.api.scene.Environment`) and a gaze field, in
-        memory or as files, in any order. A gaze field in memory knows the environment of its training.
+        Recordings (`Rays`, a file or a dataset), an environment (`nerg_mi.api.scene.AnyEnvironment`) and a gaze field,
+        in memory or as files, in any order. A gaze field in memory knows the environment of its training.
     areas : mapping or path, optional
         Areas of interest by name: boxes (two corners), meshes of trimesh, or dicts as in a file of areas; or such a
         JSON file (docs/how-to/statistics.md).
@@ -96,7 +96,7 @@ def statistics(
 
 
 def bake(
-    surface: Environment,
+    surface: AnyEnvironment,
     outputs: FilePath | Sequence[FilePath] = (),
     *,
     rays: Rays | FilePath | None = None,
@@ -108,7 +108,7 @@ def bake(
 
     Parameters
     ----------
-    surface : Environment
+    surface : AnyEnvironment
         A mesh, a scene, a radiance field or Gaussian splats, in memory or as a file.
     outputs : path or sequence of path
         Files to write (.ply, .glb, .csv, .json).
@@ -459,8 +459,8 @@ def export_scene(
     Parameters
     ----------
     scene : object or sequence of these
-        A `Scene` of `make_scene`, an environment without gaze (`nerg_mi.api.scene.Environment`), or a mesh that `bake`
-        has written, in memory or as files, all in the same frame.
+        A `Scene` of `make_scene`, an environment without gaze (`nerg_mi.api.scene.AnyEnvironment`), or a mesh that
+        `bake` has written, in memory or as files, all in the same frame.
     output : path
         File to write. ``.rrd`` needs the extra ``rerun``, the others need the extra ``usd``.
     rays : Rays, path or sequence of these, optional

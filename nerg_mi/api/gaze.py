@@ -30,7 +30,7 @@ from nerg_mi.workflows.scene_environments import ENVIRONMENTS, detect_kind
 from .arrays import Floats, as_points, as_rays
 from .calls import Progress, report_progress
 from .objects import as_file, copy_from_session, resolve_rays
-from .scene import Environment, Scene
+from .scene import AnyEnvironment, Scene
 
 if TYPE_CHECKING:
     from nerg_mi.transport.geometry import SceneGeometry
@@ -66,7 +66,7 @@ class TrainedGazeField(TrainedField[AnyGazeField]):
         origins: ArrayLike,
         directions: ArrayLike,
         *,
-        geometry: Environment = None,
+        geometry: AnyEnvironment = None,
         tolerance: float = 0.01,
         progress: Progress = None,
     ) -> Floats:
@@ -81,7 +81,7 @@ class TrainedGazeField(TrainedField[AnyGazeField]):
             Positions of the observers, in the frame of the rays of the training: the alignment of the field is applied.
         directions : array_like of shape (N, 3) or (3,)
             Directions of any length except zero, in the same frame.
-        geometry : Environment, optional
+        geometry : AnyEnvironment, optional
             What the observers see, in the frame of the field: a scene, a mesh, a radiance field, a grid, Gaussian
             splats or hit points (.vol), in memory or as a file. A `Scene` also determines how rays are
             traced, and a ``to_world`` of its gaze field is applied. Default: the geometry of the training. A field that
@@ -152,7 +152,12 @@ class TrainedGazeField(TrainedField[AnyGazeField]):
             ).mean(axis=0)
 
     def score_samples(
-        self, rays: Rays | FilePath, *, geometry: Environment = None, tolerance: float = 0.01, progress: Progress = None
+        self,
+        rays: Rays | FilePath,
+        *,
+        geometry: AnyEnvironment = None,
+        tolerance: float = 0.01,
+        progress: Progress = None,
     ) -> Floats:
         """Compute the log density of recorded rays, for observers at their origins.
 
@@ -183,7 +188,7 @@ class TrainedGazeField(TrainedField[AnyGazeField]):
         *,
         max_rays: int = 1000,
         seed: int = 0,
-        geometry: Environment = None,
+        geometry: AnyEnvironment = None,
         progress: Progress = None,
     ) -> float:
         """Compute the mean log likelihood of recorded rays, as `GaussianMixture.score` of scikit-learn does.
@@ -231,7 +236,7 @@ class TrainedGazeField(TrainedField[AnyGazeField]):
         *,
         seed: int = 0,
         num_directions: int = 16_384,
-        geometry: Environment = None,
+        geometry: AnyEnvironment = None,
         progress: Progress = None,
     ) -> Floats:
         """Draw gaze directions of an observer.
@@ -282,7 +287,7 @@ class TrainedGazeField(TrainedField[AnyGazeField]):
         levels: Sequence[float] = (0.5, 0.8),
         *,
         num_directions: int = 16_384,
-        geometry: Environment = None,
+        geometry: AnyEnvironment = None,
         progress: Progress = None,
     ) -> GazeRegions:
         """Compute the smallest regions of directions that contain given fractions of an observer's gaze.
@@ -331,7 +336,7 @@ class TrainedGazeField(TrainedField[AnyGazeField]):
         return GazeRegions(fractions, threshold, inside.sum(axis=1) * 4 * np.pi / len(cells), cells, density, inside)
 
     def _density_around(
-        self, origin: ArrayLike, count: int, geometry: Environment, progress: Progress
+        self, origin: ArrayLike, count: int, geometry: AnyEnvironment, progress: Progress
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return ``count`` directions of equal areas (count, 3) around a position, and their densities (count,)."""
         position = as_points(origin, "origin")
@@ -349,7 +354,7 @@ class TrainedGazeField(TrainedField[AnyGazeField]):
             copy_from_session(self.geometry_file, path.parent)
         return path
 
-    def _find_space(self, geometry: Environment, reporter: Reporter) -> _ObserverSpace:
+    def _find_space(self, geometry: AnyEnvironment, reporter: Reporter) -> _ObserverSpace:
         """Return what observers see: ``geometry``, or that of the training."""
         from nerg_mi.transport.field_medium import FieldMedium
 
@@ -382,7 +387,7 @@ class TrainedGazeField(TrainedField[AnyGazeField]):
 
     def _load_space(self, path: Path) -> _ObserverSpace:
         """Return the space of a geometry file; the last one is cached until the file changes."""
-        from nerg_mi.train import geometry
+        from nerg_mi.environment import environment as geometry
 
         status = path.stat()
         key = path.resolve(), status.st_mtime_ns, status.st_size

@@ -18,6 +18,14 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
+from nerg_mi.environment.contents import (
+    DensityGrid,
+    from_trimesh,
+    has_nerg,
+    is_trimesh,
+    to_scene_children,
+    write_content,
+)
 from nerg_mi.environment.trained import TrainedField
 from nerg_mi.errors import NergError
 from nerg_mi.fields.radiance import RadianceField
@@ -36,7 +44,6 @@ from nerg_mi.rendering.scene import activate_mitsuba, list_scene_files
 from nerg_mi.workflows.scene_environments import detect_kind
 
 from .arguments import check_names, resolve_file
-from .contents import DensityGrid, from_trimesh, has_nerg, is_trimesh, to_scene_children, write_content
 from .scene import Scene, make_scene
 from .session import CHECKSUM_DIGITS, is_object, session_folder
 
@@ -82,8 +89,8 @@ def as_file(value: object, name: str) -> Path:
     Parameters
     ----------
     value : object
-        A path, an environment (`nerg_mi.api.scene.Environment`), a field, `Rays`, areas, changes, an alignment, or what
-        `bake` has returned.
+        A path, an environment (`nerg_mi.api.scene.AnyEnvironment`), a field, `Rays`, areas, changes, an alignment, or
+        what `bake` has returned.
     name : str
         Name of the argument, for messages and to tell what a dict or an array contains.
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from nerg_mi.environment.contents import from_trimesh, is_trimesh, load_content, load_mesh, load_mesh_child
 from nerg_mi.errors import NergError, translate_mitsuba_errors
 from nerg_mi.files.values import FilePath
 from nerg_mi.formats.areas import Region
@@ -26,7 +27,6 @@ from nerg_mi.rendering.scene import activate_mitsuba
 from . import arrays
 from .arrays import Floats, LabelledArrays, broadcast_to_observers
 from .calls import Progress, report_progress
-from .contents import from_trimesh, is_trimesh, load_content, load_mesh, load_mesh_child
 from .scene import COLOR, Scene, make_aov_context, resolve_quantities
 
 if TYPE_CHECKING:

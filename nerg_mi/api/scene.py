@@ -12,6 +12,16 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
+from nerg_mi.environment.contents import (
+    DensityGrid,
+    FieldVolume,
+    GridVolume,
+    find_tag,
+    has_nerg,
+    load_content,
+    to_scene_children,
+    write_content,
+)
 from nerg_mi.environment.trained import TrainedField
 from nerg_mi.errors import NergError, translate_mitsuba_errors
 from nerg_mi.fields.gaze_base import AnyGazeField
@@ -31,16 +41,6 @@ from nerg_mi.transport.geometry import check_shape
 
 from .arguments import check_names, resolve_file
 from .arrays import Camera, Floats, as_points, join_names
-from .contents import (
-    DensityGrid,
-    FieldVolume,
-    GridVolume,
-    find_tag,
-    has_nerg,
-    load_content,
-    to_scene_children,
-    write_content,
-)
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -173,7 +173,7 @@ class Scene:
 
     @classmethod
     def _from_content(cls, content: dict[str, Any]) -> Scene:
-        """Make a scene of its content (`nerg_mi.api.contents`)."""
+        """Make a scene of its content (`nerg_mi.environment.contents`)."""
         scene = cls(load_content(content))
         scene._content = content
         return scene
@@ -398,13 +398,13 @@ class Scene:
         return "\n".join(["Scene", *lines])
 
 
-Environment: TypeAlias = Any
+AnyEnvironment: TypeAlias = Any
 """What observers see: a file, a `Scene`, a radiance field, splats, a `DensityGrid`, a mesh or scene of trimesh, a
 Mitsuba scene or shape, or a dict for ``mi.load_dict``."""
 
 
 def make_scene(
-    environment: Environment = None,
+    environment: AnyEnvironment = None,
     gaze: FilePath | TrainedField[AnyGazeField] | AnyGazeField | None = None,
     *,
     shapes: object = None,
@@ -417,7 +417,7 @@ def make_scene(
 
     Parameters
     ----------
-    environment : Environment, optional
+    environment : AnyEnvironment, optional
         What the observers see: a radiance field (`load_field`, `train_radiance`), Gaussian splats
         (`nerg_mi.fields.splats.Splats`) or a `DensityGrid`, in memory or as a file; a file of hit points (.vol) as
         written by `train_gaze` with ``geometry="hits"``; or shapes as for ``shapes``. Hit points are grey, shaded by
@@ -573,7 +573,7 @@ def resolve_quantities(scene: Scene, names: object, allowed: tuple[str, ...] | N
     return tuple(dict.fromkeys(requested))
 
 
-def _find_content(environment: Environment) -> dict[str, Any] | None:
+def _find_content(environment: AnyEnvironment) -> dict[str, Any] | None:
     """The content of a scene with the integrator ``nerg`` that was made in Python; None for other environments."""
     if isinstance(environment, Scene):
         return environment._content
@@ -581,7 +581,7 @@ def _find_content(environment: Environment) -> dict[str, Any] | None:
     return dict(environment) if is_scene and has_nerg(environment) else None
 
 
-def _take_shapes(environment: Environment) -> dict[str, Any]:
+def _take_shapes(environment: AnyEnvironment) -> dict[str, Any]:
     """The shapes and lights of an environment by name. Raises `NergError` for a loaded scene with a field."""
     import mitsuba as mi
 

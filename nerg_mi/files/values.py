@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import datetime
 import math
+import os
 import re
 import unicodedata
 from collections.abc import Iterable, Sequence
@@ -319,7 +320,7 @@ def find_names(names: Iterable[Any], available: Sequence[str], what: str) -> lis
 FilePath: TypeAlias = str | Path
 
 
-def to_path(path: FilePath) -> Path:
+def to_path(path: str | os.PathLike) -> Path:
     """Return ``path`` as a `Path`. Raises `NergError` for anything but a string or a path."""
     try:
         return Path(path)

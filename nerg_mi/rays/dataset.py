@@ -25,7 +25,7 @@ from nerg_mi.files.safe_read import (
     read_json,
     translate_read_errors,
 )
-from nerg_mi.files.values import FilePath, find_names, fold_name, to_name, to_path
+from nerg_mi.files.values import find_names, fold_name, to_name, to_path
 
 from .filters import select_mask
 from .rays import (
@@ -738,7 +738,7 @@ def _rows_within(rows: np.ndarray, first: int, count: int) -> np.ndarray:
     return rows[np.searchsorted(rows, first) : np.searchsorted(rows, first + count)]
 
 
-def load_rays(path: FilePath, max_rays: int | None = None, seed: int = 0) -> Rays:
+def load_rays(path: str | os.PathLike, max_rays: int | None = None, seed: int = 0) -> Rays:
     """Load recorded gaze samples.
 
     Parameters

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from nerg_mi.environment.environment import Environment
 from nerg_mi.evaluation.gaze_report import GazeResults, Verdict, compute_verdict, small_sample_factor
 from nerg_mi.fields.gaze_base import AnyGazeField
 from nerg_mi.figures.overlay import srgb, to_bytes
@@ -25,7 +26,6 @@ from nerg_mi.rays.quality import RaysSummary
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.bands import render_channels
 from nerg_mi.train.gaze_data import SURFACE_OPACITY
-from nerg_mi.train.geometry import TrainingGeometry
 from nerg_mi.transport.extrapolation import describe_extrapolation
 from nerg_mi.transport.geometry import default_march_settings, trace_depth
 from nerg_mi.transport.observer import ObserverSettings
@@ -61,7 +61,7 @@ class GazeSampler:
         Depth estimate of a ray in a medium, such as "median".
     """
 
-    def __init__(self, field: AnyGazeField, geometry: TrainingGeometry, kind: str = "median"):
+    def __init__(self, field: AnyGazeField, geometry: Environment, kind: str = "median"):
         self.field, self._kind = field, kind
         self._geometry = geometry.scene_geometry
         self._has_geometry = geometry.medium is not None
@@ -107,7 +107,7 @@ class GazeSampler:
         return make_gaze_evaluator(self._gaze, self._geometry, self._settings, observer)
 
 
-def sample_eye_positions(rays: Rays, geometry: TrainingGeometry, max_positions: int) -> EyePositions:
+def sample_eye_positions(rays: Rays, geometry: Environment, max_positions: int) -> EyePositions:
     """Sample about ``max_positions`` viewpoints from ``rays``, the same number for each participant.
 
     The samples of a participant are evenly spaced in time. Each participant starts at a different phase, so that the
@@ -132,7 +132,7 @@ def sample_eye_positions(rays: Rays, geometry: TrainingGeometry, max_positions: 
 
 def assign_ray_hits(
     rays: Rays,
-    geometry: TrainingGeometry,
+    geometry: Environment,
     sampler: GazeSampler,
     max_rays: int,
     aois: Sequence[Aoi],

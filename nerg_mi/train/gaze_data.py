@@ -12,6 +12,7 @@ import drjit as dr
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from nerg_mi.environment.environment import DEFAULT_DEPTH, Environment
 from nerg_mi.errors import NergError
 from nerg_mi.fields.gaze_base import GazeHeadConfig, RaySupport, add_prior_floor, make_prior_table, table_directions
 from nerg_mi.fields.kde import SphericalKde
@@ -28,7 +29,6 @@ from nerg_mi.transport.geometry import SceneGeometry, default_march_settings, tr
 from nerg_mi.transport.observer_gaze import interpolate_nearest_depth
 
 from .gaze_settings import MIN_MEAN_DENSITY, GazeSettings, ProbeSettings
-from .geometry import DEFAULT_DEPTH, TrainingGeometry
 
 # ---- Position-independent prior: the gaze density averaged over all positions ----
 
@@ -58,7 +58,7 @@ def check_prior_kappa(rows: int, kappa: float | None) -> None:
 def make_prior_from_rays(
     rays: Rays,
     rows: int,
-    geometry: TrainingGeometry | None = None,
+    geometry: Environment | None = None,
     seed: int = 0,
     weights: str = "equal",
     kappa: float | None = None,
@@ -71,7 +71,7 @@ def make_prior_from_rays(
         Gaze rays, in their own frame.
     rows : int
         Rows of the table.
-    geometry : TrainingGeometry, optional
+    geometry : Environment, optional
         Its frame is the frame of the table. Default: the frame of the rays.
     seed : int
         Seed of the subsample of rays.
@@ -184,13 +184,13 @@ FEATURE_BATCH = 1 << 18  # Rays per kernel launch
 
 
 def compute_semantic_features(
-    geometry: TrainingGeometry, origins: np.ndarray, directions: np.ndarray, distance: np.ndarray, kind: str
+    geometry: Environment, origins: np.ndarray, directions: np.ndarray, distance: np.ndarray, kind: str
 ) -> np.ndarray:
     """Evaluate the features of a radiance field along rays.
 
     Parameters
     ----------
-    geometry : TrainingGeometry
+    geometry : Environment
         Training geometry; must be a radiance field.
     origins, directions : numpy.ndarray
         Ray origins and unit directions (N, 3) in the frame of ``geometry``.
@@ -265,7 +265,7 @@ class Supervision:
         num_participants = len(np.unique(self.rays.person))
         return {"rays": len(self.rays), "people": num_participants, **views, "tracking": self.rays.tracking}
 
-    def make_support(self, radius: float, geometry: TrainingGeometry) -> RaySupport | None:
+    def make_support(self, radius: float, geometry: Environment) -> RaySupport | None:
         """Return the local ray count as a function of position in the frame of ``geometry``, for probes of ``radius``
         metres.
 
@@ -305,7 +305,7 @@ class ValidationSplit:
 
 
 def split_validation(
-    supervision: Supervision, geometry: TrainingGeometry, settings: GazeSettings, probes: ProbeSettings
+    supervision: Supervision, geometry: Environment, settings: GazeSettings, probes: ProbeSettings
 ) -> ValidationSplit:
     """Hold out zones of positions for validation, as many as ``settings.zones``.
 
@@ -444,7 +444,7 @@ SURFACE_OPACITY = 0.5  # Opacity from which a ray counts as hitting a surface; t
 
 
 def compute_surface_distances(
-    geometry: TrainingGeometry,
+    geometry: Environment,
     positions: np.ndarray,
     directions: np.ndarray,
     depth: str = "median",
@@ -454,7 +454,7 @@ def compute_surface_distances(
 
     Parameters
     ----------
-    geometry : TrainingGeometry
+    geometry : Environment
         Training geometry. Without any surfaces, each distance is ``DEFAULT_DEPTH`` and no ray counts as a miss.
     positions : numpy.ndarray
         Observer positions (P, 3), in the frame and units of ``geometry``.
@@ -500,7 +500,7 @@ def compute_surface_distances(
     return distance, misses
 
 
-def find_hit_points(rays: Rays, geometry: TrainingGeometry, depth: str = "median") -> np.ndarray | None:
+def find_hit_points(rays: Rays, geometry: Environment, depth: str = "median") -> np.ndarray | None:
     """Find the points that ``rays`` hit: the recorded ones, otherwise those on the surfaces of ``geometry``.
 
     Returns points (N, 3) in metres in the frame of the rays, NaN for a ray without one; None if no surface is known.
@@ -586,7 +586,7 @@ def make_observer_targets(
     positions: np.ndarray,
     directions: np.ndarray,
     truth: np.ndarray,
-    geometry: TrainingGeometry,
+    geometry: Environment,
     depth: str = "median",
     requirements: TargetRequirements | None = None,
 ) -> GazeTargets:
@@ -600,7 +600,7 @@ def make_observer_targets(
         Unit directions (P, D, 3).
     truth : numpy.ndarray
         Densities (P, D) in 1/sr.
-    geometry : TrainingGeometry
+    geometry : Environment
         Geometry in which the surface distances are traced.
     depth : str
         Depth estimator (``transport.depth``).
@@ -769,7 +769,7 @@ def make_probes(rays: Rays, settings: ProbeSettings, queries: np.ndarray | None 
 
 def make_targets_from_probes(
     probes: Probes,
-    geometry: TrainingGeometry,
+    geometry: Environment,
     directions: int,
     depth: str = "median",
     requirements: TargetRequirements | None = None,
@@ -799,7 +799,7 @@ def make_targets_from_probes(
 
 def make_targets_from_rays(
     rays: Rays,
-    geometry: TrainingGeometry,
+    geometry: Environment,
     settings: ProbeSettings,
     requirements: TargetRequirements | None = None,
     queries: np.ndarray | None = None,
@@ -848,7 +848,7 @@ _DIRECTIONS_PER_PIXEL = 4  # Directions per pixel of a view, so that hardly any 
 
 def make_targets_from_views(
     views: Sequence[SalienceView],
-    geometry: TrainingGeometry,
+    geometry: Environment,
     settings: ProbeSettings,
     requirements: TargetRequirements | None = None,
     seed: int = 0,

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from nerg_mi.environment.environment import Environment
 from nerg_mi.errors import NergError
 from nerg_mi.fields.gaze_base import AnyGazeField, GazeEnsemble, GazeHead, summarize_provenance
 from nerg_mi.files.schema import check_json
@@ -34,7 +35,6 @@ from .gaze_run import train_gaze
 from .gaze_settings import GazeSettings
 from .gaze_trainer import KIND as RUN
 from .gaze_trainer import GazePlan, ProgressCallback, StateSettings, read_run_identity
-from .geometry import TrainingGeometry
 from .trainer import check_same_run, reading_run_state, saving_on_failure
 
 MIN_BLOCKS = 5  # Minimum number of blocks for resampling; participants are the blocks if there are at least this many
@@ -98,7 +98,7 @@ class TrainedEnsemble(NamedTuple):
 def train_ensemble(
     members: int,
     supervision: Supervision,
-    geometry: TrainingGeometry,
+    geometry: Environment,
     plan: GazePlan,
     ns: ModuleType,
     *,

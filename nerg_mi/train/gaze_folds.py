@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import drjit as dr
 import numpy as np
 
+from nerg_mi.environment.environment import Environment
 from nerg_mi.errors import NergError
 from nerg_mi.fields.gaze_base import GazeHead, GazeHeadConfig, interpolate_table
 from nerg_mi.fields.gaze_hits import MAX_HITS, NearestOrigins, ReaimedHits, place_missing_points
@@ -34,7 +35,6 @@ from .gaze_data import (
 )
 from .gaze_settings import GazeSettings
 from .gaze_trainer import GazePlan, GazeProgress, GazeTrainer, ProgressCallback
-from .geometry import TrainingGeometry
 
 # ---- Selection of the prior ----
 #
@@ -125,7 +125,7 @@ class PriorSelection:
             raise ValueError('its "hits_bandwidth" and "hits_kappa" must be positive')
         return selection
 
-    def apply_prior(self, field: GazeHead, rays: Rays | None, geometry: TrainingGeometry, plan: GazePlan) -> None:
+    def apply_prior(self, field: GazeHead, rays: Rays | None, geometry: Environment, plan: GazePlan) -> None:
         """Set the prior of a ``field`` that was trained on ``rays``."""
         table = None
         if self.prior_kappa is not None and rays is not None:
@@ -136,7 +136,7 @@ class PriorSelection:
         rest = 1 - self.hits_weight
         field.set_prior(round(min(self.prior_weight / rest, 1.0), 6) if rest else 1.0, table)
 
-    def make_hits(self, rays: Rays | None, geometry: TrainingGeometry, plan: GazePlan) -> ReaimedHits | None:
+    def make_hits(self, rays: Rays | None, geometry: Environment, plan: GazePlan) -> ReaimedHits | None:
         """Make the re-aimed hits of ``rays`` for the field; None if their weight is zero."""
         if not self.hits_weight or rays is None or self.hits_bandwidth is None or self.hits_kappa is None:
             return None
@@ -242,7 +242,7 @@ def _log(density: np.ndarray) -> np.ndarray:
 
 def evaluate_folds(
     supervision: Supervision,
-    geometry: TrainingGeometry,
+    geometry: Environment,
     plan: GazePlan,
     ns: ModuleType,
     on_progress: ProgressCallback = lambda progress: None,
@@ -253,7 +253,7 @@ def evaluate_folds(
     ----------
     supervision : Supervision
         Training data with rays.
-    geometry : TrainingGeometry
+    geometry : Environment
         Training geometry, the same in all folds. Geometry made of hit points includes the surfaces that held-out
         participants looked at, but not who looked at them.
     plan : GazePlan
@@ -309,7 +309,7 @@ def _evaluate_fold(
     prior_table: np.ndarray,
     train: Rays,
     test: Rays,
-    geometry: TrainingGeometry,
+    geometry: Environment,
     plan: GazePlan,
     needs: TargetRequirements,
 ) -> FoldDensities:
@@ -340,9 +340,7 @@ def _evaluate_fold(
     return FoldDensities(test.person, field[:, -1], prior[:, -1], field[:, :-1], prior[:, :-1], hits, make_hit_maps)
 
 
-def _make_hits(
-    rays: Rays, geometry: TrainingGeometry, bandwidth: float, kappa: float, weight: float = 1.0
-) -> ReaimedHits:
+def _make_hits(rays: Rays, geometry: Environment, bandwidth: float, kappa: float, weight: float = 1.0) -> ReaimedHits:
     """Make the re-aimed hits of ``rays`` with hit points, if any; ``bandwidth`` is in metres."""
     bandwidth *= geometry.align.scale
     origins, directions = geometry.points_to_field(rays.origin), geometry.directions_to_field(rays.direction)
@@ -352,7 +350,7 @@ def _make_hits(
 
 
 def _evaluate_hit_kernels(
-    rays: Rays, geometry: TrainingGeometry, positions: np.ndarray, directions: np.ndarray, ns: ModuleType
+    rays: Rays, geometry: Environment, positions: np.ndarray, directions: np.ndarray, ns: ModuleType
 ) -> tuple[np.ndarray, NearestOrigins]:
     """Evaluate the re-aimed hits of ``rays`` with each of `HIT_KERNELS` (n, C) in ``directions`` from ``positions``
     (n, 3). Also returns the samples nearest to the positions, which are the same for all kernels."""
@@ -433,7 +431,7 @@ SELECTION_KEY = "choice"  # Key of the selection in the run identity (``GazePlan
 
 def select_variant(
     supervision: Supervision,
-    geometry: TrainingGeometry,
+    geometry: Environment,
     plan: GazePlan,
     ns: ModuleType,
     on_progress: ProgressCallback = lambda progress: None,

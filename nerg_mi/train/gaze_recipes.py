@@ -12,12 +12,12 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from nerg_mi.environment.environment import Environment
 from nerg_mi.errors import NergError
 from nerg_mi.fields.gaze_base import GazeHeadConfig, kinds
 
 from .gaze_settings import GazeSettings, ProbeSettings
 from .gaze_trainer import GazePlan, GazeTrainer
-from .geometry import TrainingGeometry
 
 # Command-line options of supported options with another name.
 _SPELLING = {"init": "--init field"}
@@ -38,7 +38,7 @@ class FieldOptions:
     normalized: bool = False  # Whether the density is divided by its integral over the sphere
     semantic: str = ""  # Radiance-field features as input of emit (`fields.gaze_product.SEMANTICS`); "": none
     semantic_own: bool = False  # Whether emit also has the field's own features
-    geometry_kind: str = "field"  # Kind of the training geometry (`TrainingGeometry.kind`)
+    geometry_kind: str = "field"  # Kind of the training geometry (`Environment.kind`)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +62,7 @@ class Recipe:
 
     def make_plan(
         self,
-        geometry: TrainingGeometry,
+        geometry: Environment,
         options: FieldOptions | None = None,
         *,
         settings: Mapping[str, Any] | None = None,
@@ -74,7 +74,7 @@ class Recipe:
 
         Parameters
         ----------
-        geometry : TrainingGeometry
+        geometry : Environment
             Training geometry.
         options : FieldOptions, optional
             Options of the field.

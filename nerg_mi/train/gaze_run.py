@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from nerg_mi.environment.environment import Environment
 from nerg_mi.fields.gaze_base import GazeHead, summarize_provenance
 
 from .gaze_data import (
@@ -43,7 +44,6 @@ from .gaze_trainer import (
     refit,
     round_scores,
 )
-from .geometry import TrainingGeometry
 from .trainer import saving_on_failure
 
 # ---- Training run ----
@@ -63,7 +63,7 @@ class TrainedGaze(NamedTuple):
 
 def train_gaze(
     supervision: Supervision,
-    geometry: TrainingGeometry,
+    geometry: Environment,
     plan: GazePlan,
     ns: ModuleType,
     *,
@@ -77,7 +77,7 @@ def train_gaze(
     ----------
     supervision : Supervision
         Gaze rays and salience views.
-    geometry : TrainingGeometry
+    geometry : Environment
         Geometry in which the surface points are traced.
     plan : GazePlan
         Architecture, settings and trainer.
@@ -195,7 +195,7 @@ def train_gaze(
 
 def make_targets(
     supervision: Supervision,
-    geometry: TrainingGeometry,
+    geometry: Environment,
     plan: GazePlan,
     requirements: TargetRequirements,
     seed: int,
@@ -216,9 +216,7 @@ def make_targets(
     return concatenate_targets(targets, make_targets_from_views(views, geometry, probes, requirements, seed))
 
 
-def _make_provenance(
-    supervision: Supervision, environment: TrainingGeometry, plan: GazePlan, targets: GazeTargets
-) -> dict:
+def _make_provenance(supervision: Supervision, environment: Environment, plan: GazePlan, targets: GazeTargets) -> dict:
     """Return the settings and data of the training (JSON)."""
     return {
         "settings": plan.settings.to_dict(),

@@ -14,6 +14,7 @@ import drjit as dr
 import numpy as np
 from drjit.opt import AdamW
 
+from nerg_mi.environment.environment import Environment
 from nerg_mi.errors import NergError, sanitize
 from nerg_mi.fields.gaze_base import GazeHead, GazeHeadConfig
 from nerg_mi.fields.radiance import RadianceField
@@ -24,7 +25,6 @@ from nerg_mi.maths.geometry import AnyBox
 
 from .gaze_data import GazeBatch, GazeTargets, Supervision, TargetArrays
 from .gaze_settings import MIN_MEAN_DENSITY, GazeSettings, ProbeSettings
-from .geometry import TrainingGeometry
 from .trainer import Trainer, check_same_run, check_shape, read_count, reading_run_state
 
 # ---- Losses between predicted and true gaze densities of probes, in Dr.Jit ----
@@ -489,7 +489,7 @@ class GazePlan:
         """Return the plan with changed ``settings``."""
         return replace(self, settings=replace(self.settings, **changes))
 
-    def make_identity(self, supervision: Supervision, geometry: TrainingGeometry, state: StateSettings) -> dict:
+    def make_identity(self, supervision: Supervision, geometry: Environment, state: StateSettings) -> dict:
         """Return the data that must match for a run to be resumed (JSON)."""
         return {
             **state.identity,
@@ -502,7 +502,7 @@ class GazePlan:
         }
 
 
-def alignment_to_json(geometry: TrainingGeometry) -> list[list[float]] | None:
+def alignment_to_json(geometry: Environment) -> list[list[float]] | None:
     """Return the similarity from the frame of the rays to that of the geometry as JSON; None if both are the same."""
     return None if geometry.align.is_identity else geometry.align.matrix.tolist()
 

@@ -10,6 +10,8 @@ from types import ModuleType
 import numpy as np
 
 from nerg_mi.alignment.check import check_alignment
+from nerg_mi.environment import environment as geometry
+from nerg_mi.environment.environment import Environment
 from nerg_mi.errors import NergError
 from nerg_mi.formats.fields import matches_checksum
 from nerg_mi.maths.geometry import AnyBox, Similarity
@@ -17,9 +19,6 @@ from nerg_mi.options import GeometryOptions
 from nerg_mi.photos.salience import SalienceView
 from nerg_mi.progress import SILENT, Reporter
 from nerg_mi.rays.rays import Rays
-
-from . import geometry
-from .geometry import TrainingGeometry
 
 # ---- Geometry of gaze workflows ----
 #
@@ -49,7 +48,7 @@ def make_geometry(
     ns: ModuleType,
     voxel: float | None = None,
     reporter: Reporter = SILENT,
-) -> TrainingGeometry:
+) -> Environment:
     """Create the selected geometry.
 
     Parameters
@@ -113,7 +112,7 @@ def load_training_geometry(
     field: Path | None = None,
     scene: Path | None = None,
     choice: Path | str | None = None,
-) -> TrainingGeometry:
+) -> Environment:
     """Load the geometry of the training of the checkpoint ``gaze``, with the alignment of the training.
 
     The file is ``field``, ``scene`` or ``choice`` (a volume), or the one with the stored name next to the checkpoint.
@@ -125,8 +124,8 @@ def load_training_geometry(
         _check_trained_kind(gaze, provenance, str(choice))
         choice = None
     if provenance.get("geometry") == "none":
-        return TrainingGeometry(None, box, "none", align=align)
-    makers: dict[str, tuple[Path | None, str, Callable[[Path], TrainingGeometry]]] = {
+        return Environment(None, box, "none", align=align)
+    makers: dict[str, tuple[Path | None, str, Callable[[Path], Environment]]] = {
         "field_file": (field, "--field", lambda path: geometry.load_field_geometry(path, ns)),
         "scene_file": (scene, "--scene", geometry.load_scene_geometry),
         "geometry_file": (None if choice is None else Path(choice), "--geometry", geometry.load_volume_geometry),
@@ -181,7 +180,7 @@ def find_training_file(gaze: Path, provenance: dict, explicit: Path | None, wher
 
 
 def check_geometry(
-    environment: TrainingGeometry, rays: Rays | None, options: str, force: bool, reporter: Reporter = SILENT
+    environment: Environment, rays: Rays | None, options: str, force: bool, reporter: Reporter = SILENT
 ) -> None:
     """Warn if ``rays`` do not fit the geometry: gaze without hits, or heads inside objects.
 

@@ -13,6 +13,8 @@ from nerg_mi.alignment.icp import Twin
 from nerg_mi.alignment.points import read_cameras, read_pairs
 from nerg_mi.alignment.similarity import transform_points
 from nerg_mi.alignment.tracking import Tracking, compare_flips
+from nerg_mi.environment import environment as geometry
+from nerg_mi.environment.environment import Environment
 from nerg_mi.errors import NergError
 from nerg_mi.figures.maps import alignment_figure
 from nerg_mi.figures.style import make_provenance, save
@@ -23,8 +25,6 @@ from nerg_mi.photos.colmap import rotation_to_z
 from nerg_mi.progress import SILENT, Reporter
 from nerg_mi.rays.direction_checks import DECLARED
 from nerg_mi.rays.rays import Rays
-from nerg_mi.train import geometry
-from nerg_mi.train.geometry import TrainingGeometry
 
 from .base import select_backend
 from .rays_commands import AlignOptions
@@ -143,7 +143,7 @@ def _path(path: Path | None) -> Path:
     return path
 
 
-def _target(options: AlignOptions, kind: str, reporter: Reporter) -> tuple[TrainingGeometry | None, AlignmentTarget]:
+def _target(options: AlignOptions, kind: str, reporter: Reporter) -> tuple[Environment | None, AlignmentTarget]:
     kinds = [n for n in ("field", "scene", "surface") if getattr(options, n) is not None]
     if len(kinds) > 1:
         raise NergError(f"only one scene can be given: use --{' or --'.join(kinds)}")
@@ -263,7 +263,7 @@ def _report_alignment(alignment: Alignment, reporter: Reporter) -> None:
         )
 
 
-def _report_check(environment: TrainingGeometry, rays: Rays, matrix: np.ndarray, reporter: Reporter) -> None:
+def _report_check(environment: Environment, rays: Rays, matrix: np.ndarray, reporter: Reporter) -> None:
     assert environment.medium is not None
     check = check_alignment(environment.medium, rays, Similarity(matrix))
     reporter.message(

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from nerg_mi.environment.environment import Environment
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation import gaze as evaluation
 from nerg_mi.evaluation.baselines import (
@@ -51,7 +52,6 @@ from nerg_mi.rays.rays import TRACKING, Rays
 from nerg_mi.tasks.task import FOLDER_SUFFIX, RENDER_LIBRARIES, Part, Plan
 from nerg_mi.threads import set_thread_count
 from nerg_mi.train.gaze_data import find_hit_points
-from nerg_mi.train.geometry import TrainingGeometry
 from nerg_mi.train.geometry_files import check_geometry, geometry_kind, load_training_geometry
 
 from .base import select_backend
@@ -259,7 +259,7 @@ def print_evaluation(
 def _positions(
     test: evaluation.GazeTest,
     loaded: AnyGazeField,
-    environment: TrainingGeometry,
+    environment: Environment,
     members_of: Baseline,
     prior: Baseline,
     groups: list[str] | None,

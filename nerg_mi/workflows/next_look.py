@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from nerg_mi.environment.environment import Environment
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation.baselines import UNIFORM_DENSITY, Baseline, make_prior_baseline
 from nerg_mi.evaluation.gaze import EPS, FieldDensity, format_score_table
@@ -38,7 +39,6 @@ from nerg_mi.progress import SILENT, Reporter
 from nerg_mi.rays.filters import split_by_person
 from nerg_mi.rays.rays import Rays
 from nerg_mi.train.gaze_data import SURFACE_OPACITY, select_prior_kappa
-from nerg_mi.train.geometry import TrainingGeometry
 from nerg_mi.train.geometry_files import load_training_geometry
 from nerg_mi.transport.extrapolation import warn_extrapolation
 from nerg_mi.transport.geometry import trace_depth
@@ -217,7 +217,7 @@ def _sample_looks(
     )
 
 
-def make_ray_distance(environment: TrainingGeometry) -> RayDistance | None:
+def make_ray_distance(environment: Environment) -> RayDistance | None:
     """Return the distance in metres to the first surface of a geometry along rays; None without geometry."""
     medium = environment.medium
     if medium is None:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from nerg_mi.environment.environment import Environment
 from nerg_mi.errors import MissingFile, NergError, sanitize, translate_mitsuba_errors
 from nerg_mi.evaluation.gaze_report import GazeResults, read_results
 from nerg_mi.fields.gaze_base import AnyGazeField, tracking_suffix
@@ -57,7 +58,6 @@ from nerg_mi.reports.data import (
     summarize_objects,
 )
 from nerg_mi.reports.sections import render_page
-from nerg_mi.train.geometry import TrainingGeometry
 from nerg_mi.transport.geometry import SceneGeometry
 from nerg_mi.transport.observer import sensor_center
 
@@ -376,7 +376,7 @@ def find_free_positions(
 
 
 def count_participants_near(
-    rays: Rays, viewpoints: np.ndarray, environment: TrainingGeometry, radius: float
+    rays: Rays, viewpoints: np.ndarray, environment: Environment, radius: float
 ) -> tuple[int, ...]:
     """Count the participants with a ray within ``radius`` metres of each of the ``viewpoints`` (P, 3)."""
     from scipy.spatial import KDTree
@@ -387,7 +387,7 @@ def count_participants_near(
     return tuple(len(np.unique(rays.person[rows])) for rows in neighbours)
 
 
-def collect_paths(rays: Rays, environment: TrainingGeometry) -> list[np.ndarray]:
+def collect_paths(rays: Rays, environment: Environment) -> list[np.ndarray]:
     """Return the paths of participants, (n, 3) each, in scene coordinates, interrupted where there are no rays.
 
     If there are more than a page can hold, evenly selected ones are returned.
@@ -677,17 +677,15 @@ class _ReportWork:
             marker = None if pixel is None else tuple((v + 0.5) * share - 0.5 for v in pixel)
         return RenderedViews(views, marker, is_supported(loaded, loaded.sensors()[0]), describe_basis(loaded))
 
-    def _environment(self, scene: SceneResult) -> TrainingGeometry:
+    def _environment(self, scene: SceneResult) -> Environment:
         """Return the geometry of the scene, in which depths are traced."""
         kind = self.files.scene.kind
         if kind == "none":
-            return TrainingGeometry(None, self.field.box, kind, align=self.align)
+            return Environment(None, self.field.box, kind, align=self.align)
         loaded = self._load(scene, radiance="false", aovs="opacity")
-        return TrainingGeometry(
-            SceneGeometry(loaded.integrator().medium, loaded), self.field.box, kind, align=self.align
-        )
+        return Environment(SceneGeometry(loaded.integrator().medium, loaded), self.field.box, kind, align=self.align)
 
-    def _viewpoints(self, environment: TrainingGeometry, scene: SceneResult) -> EyePositions:
+    def _viewpoints(self, environment: Environment, scene: SceneResult) -> EyePositions:
         """Return recorded positions, or that of the observer."""
         if self.rays is not None:
             return sample_eye_positions(self.rays, environment, self.options.viewpoints)
@@ -701,7 +699,7 @@ class _ReportWork:
         self,
         areas: AreaSet,
         sampler: GazeSampler,
-        environment: TrainingGeometry,
+        environment: Environment,
         viewpoints: EyePositions,
         rays: Rays | None,
     ) -> tuple[ObjectAttention, ...]:
@@ -720,7 +718,7 @@ class _ReportWork:
         self,
         scene: SceneResult,
         sampler: GazeSampler,
-        environment: TrainingGeometry,
+        environment: Environment,
         viewpoints: EyePositions,
         boxes: Sequence[Region],
     ) -> tuple[str | None, tuple[int, int, int, int]]:

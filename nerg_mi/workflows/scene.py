@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.alignment.check import read_similarity
+from nerg_mi.environment.environment import make_hit_geometry
 from nerg_mi.errors import NergError
 from nerg_mi.figures.overview import PinholeFrame, SeenSurfaces
 from nerg_mi.files.atomic import check_writable, write_text
@@ -30,7 +31,6 @@ from nerg_mi.rendering.scene_writer import (
     free_default_name,
     relative_path,
 )
-from nerg_mi.train.geometry import make_hit_geometry
 
 from .base import select_backend
 from .render import describe_observer

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from nerg_mi.environment.environment import DEFAULT_DEPTH
+from nerg_mi.environment.hits import shade_hits
 from nerg_mi.errors import MissingFile, NergError, sanitize
 from nerg_mi.files.safe_read import check_regular_file, resolve_path, translate_read_errors
 from nerg_mi.formats.checkpoint import read_metadata
@@ -35,7 +37,6 @@ from nerg_mi.rendering.scene_writer import (
     prop,
     relative_path,
 )
-from nerg_mi.train.geometry import DEFAULT_DEPTH, shade_hits
 from nerg_mi.train.geometry_files import find_training_file, geometry_key, read_training_alignment
 from nerg_mi.transport.geometry import HEADLIGHT
 
@@ -433,7 +434,7 @@ def _hits(path: Path, output: Path, words: str) -> WrittenGeometry:
 
     def make(folder: Path, center: str) -> SceneContent:
         # Interpolation rounds the edges of voxels; it moves surfaces by less than half a voxel from where a training
-        # looked for them (`train.geometry.make_volume_dict`).
+        # looked for them (`nerg_mi.environment.hits.make_volume_dict`).
         box = prop("boolean", "use_grid_bbox", "true")
         density = element("volume", prop("string", "filename", "$density"), box, name="density", type="gridvolume")
         file = prop("string", "filename", "$color")

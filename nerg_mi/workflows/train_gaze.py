@@ -12,6 +12,7 @@ from types import ModuleType
 import numpy as np
 
 from nerg_mi.alignment.check import read_similarity
+from nerg_mi.environment.environment import Environment
 from nerg_mi.errors import NergError, blame_options
 from nerg_mi.fields.gaze_base import AnyGazeField
 from nerg_mi.files.atomic import check_writable, reserve_output
@@ -32,7 +33,6 @@ from nerg_mi.train.gaze_log_density import ELEVATION_KAPPA, make_elevation_prior
 from nerg_mi.train.gaze_recipes import FieldOptions, Recipe, get_recipe
 from nerg_mi.train.gaze_settings import GazeSettings, ProbeSettings
 from nerg_mi.train.gaze_trainer import GazePlan, GazeProgress, StateSettings
-from nerg_mi.train.geometry import TrainingGeometry
 from nerg_mi.train.geometry_files import check_geometry, geometry_kind, make_geometry
 
 from .base import select_backend
@@ -46,7 +46,7 @@ from .gaze_commands import GazeOptions, PriorOptions
 # Check of the options, and the training plan that results from them and the recipe.
 
 
-def plan_gaze(options: GazeOptions, environment: TrainingGeometry, views_alone: bool = False) -> GazePlan:
+def plan_gaze(options: GazeOptions, environment: Environment, views_alone: bool = False) -> GazePlan:
     """Return the training plan for ``options`` and the geometry; ``views_alone`` tells that there are no rays.
 
     Raises `NergError` for contradictory options.
@@ -251,7 +251,7 @@ def _train(
 
 def train_planned(
     supervision: Supervision,
-    environment: TrainingGeometry,
+    environment: Environment,
     plan: GazePlan,
     ns: ModuleType,
     output: Path | None = None,

@@ -11,12 +11,17 @@ import pytest
 import nerg_mi as nerg
 from nerg_mi.api import gaze as gaze_api
 from nerg_mi.api.gaze import TrainedGazeField
+from nerg_mi.environment.environment import (
+    identify_file,
+    load_field_geometry,
+    load_scene_geometry,
+    load_volume_geometry,
+)
 from nerg_mi.evaluation.gaze import FieldDensity
 from nerg_mi.formats.fields import save_gaze
 from nerg_mi.formats.surfaces import write_volume
 from nerg_mi.maths.geometry import Box
 from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.train.geometry import identify_file, load_field_geometry, load_scene_geometry, load_volume_geometry
 from tests.evaluation.gaze_fields import made
 from tests.plugins import fields
 

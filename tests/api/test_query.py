@@ -9,12 +9,12 @@ import pytest
 import nerg_mi as nerg
 from nerg_mi.aoi.options import StatisticsOptions
 from nerg_mi.api.query import SceneObserver, compute_box_shares
+from nerg_mi.environment.environment import Environment
 from nerg_mi.formats.areas import Region
 from nerg_mi.measures.shares import COARSE, gaze_shares
 from nerg_mi.measures.visits import MARGIN, BoxAoi
 from nerg_mi.progress import WarningReporter
 from nerg_mi.reports.data import GazeSampler
-from nerg_mi.train.geometry import TrainingGeometry
 from nerg_mi.transport.mitsuba_mesh import make_mesh
 from nerg_mi.workflows.statistics import statistics
 from tests.aoi.place import SIGN, STAND, write_place
@@ -279,7 +279,7 @@ def test14_statistics_viewer_and_report_agree(room):
     *_, viewer = iter_attention_shares(scene, eye, regions, [])
     assert viewer["the sign"].share == pytest.approx(position.share[0], rel=0.03)
     field = scene.integrator.gaze.field
-    onlooker = GazeSampler(field, TrainingGeometry(scene.geometry, field.box, "scene"))
+    onlooker = GazeSampler(field, Environment(scene.geometry, field.box, "scene"))
     things = [BoxAoi(region) for region in regions]
     report = gaze_shares(onlooker.query_from, eye[None], things, [(0,), (1,)], MARGIN, COARSE)
     assert report.share[0, 0] == pytest.approx(position.share[0], rel=0.03)

@@ -8,9 +8,9 @@ import pytest
 
 import nerg_mi as nerg
 from nerg_mi.api.analysis import bake, statistics
-from nerg_mi.api.contents import load_content, load_mesh_child, to_scene_children
 from nerg_mi.api.objects import build_options
 from nerg_mi.api.scene import resolve_quantities
+from nerg_mi.environment.contents import load_content, load_mesh_child, to_scene_children
 from nerg_mi.environment.trained import TrainedField
 from nerg_mi.errors import NergError
 from nerg_mi.formats.surfaces import write_volume

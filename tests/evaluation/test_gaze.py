@@ -9,6 +9,7 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
+from nerg_mi.environment.environment import load_field_geometry, load_scene_geometry
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation import gaze, metrics
 from nerg_mi.evaluation.baselines import make_prior_baseline, make_uniform_baseline
@@ -20,7 +21,6 @@ from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.probes.probes import place_probes
 from nerg_mi.rays.rays import Rays
 from nerg_mi.train.gaze_data import hold_out
-from nerg_mi.train.geometry import load_field_geometry, load_scene_geometry
 from tests.evaluation.gaze_fields import KINDS, made, saved
 from tests.plugins import fields
 from tests.plugins.scenes import camera, channels

@@ -11,6 +11,7 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
+from nerg_mi.environment.environment import load_field_geometry
 from nerg_mi.errors import MissingFile, NergError
 from nerg_mi.fields.splats import Splats
 from nerg_mi.formats import ply as ply_tables
@@ -31,7 +32,6 @@ from nerg_mi.formats.splats import (
     write_ply_splats,
 )
 from nerg_mi.maths.sphere import SH_C0
-from nerg_mi.train.geometry import load_field_geometry
 from nerg_mi.transport.field_medium import FieldMedium
 from nerg_mi.transport.geometry import trace_depth
 from nerg_mi.transport.splat_medium import SplatArrays, SplatMedium

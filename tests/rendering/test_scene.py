@@ -81,7 +81,7 @@ def test_mitsuba_does_not_open_an_obj_that_it_would_misread(rgb, tmp_path, kind,
     (tmp_path / "s.xml").write_bytes(f'\ufeff<scene version="3.0.0">{shape}</scene>'.encode())
     with pytest.raises(NergError, match=rf"a\.obj.*{said}"):
         if "dict" in form:
-            from nerg_mi.api.contents import load_content
+            from nerg_mi.environment.contents import load_content
 
             child = {"type": "obj", "filename": str(tmp_path / "a.obj")}
             group = {"type": "shapegroup", "a": child}
@@ -308,8 +308,8 @@ def test_spp_option_is_bounded(tmp_path):
 
 
 def test_other_entry_points_are_checked(standins, tmp_path):
+    from nerg_mi.environment.environment import load_scene_geometry
     from nerg_mi.evaluation import study_subject
-    from nerg_mi.train.geometry import load_scene_geometry
     from nerg_mi.workflows.demo import make_demo
     from nerg_mi.workflows.scene_commands import DemoOptions
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.api.scene import make_scene
+from nerg_mi.environment.environment import Environment
 from nerg_mi.evaluation.gaze_report import GazeResults, small_sample_factor
 from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.gaze_product import GazeConfig, GazeField
@@ -38,7 +39,6 @@ from nerg_mi.reports.data import (
     sample_eye_positions,
     summarize_objects,
 )
-from nerg_mi.train.geometry import TrainingGeometry
 from nerg_mi.transport.geometry import SceneGeometry
 from tests.evaluation.test_gaze import crowd
 from tests.reports.made import full_run, minimal_run, stage
@@ -56,7 +56,7 @@ def hall(rgb):
     box = Box(tuple(LOW), tuple(HIGH))
     config = GazeConfig(grid=HashGridConfig(levels=4, log2_rows=10, base=4, finest=16), width=16, normalized=True)
     field = GazeField.random(config, box, namespace(rgb.variant()), 3)
-    place = TrainingGeometry(SceneGeometry(None, scene), box, "scene")
+    place = Environment(SceneGeometry(None, scene), box, "scene")
     return GazeSampler(field, place), place
 
 
@@ -142,7 +142,7 @@ def test_rays_in_another_frame(hall, rgb):
     """Rotated by 90 degrees about z, scaled by two and translated."""
     onlooker, place = hall
     matrix = np.array([[0, -0.1, 0, 1], [0.1, 0, 0, 0], [0, 0, 0.1, 0.5], [0, 0, 0, 1.0]])
-    turned = TrainingGeometry(place.medium, place.box, "scene", align=Similarity(matrix))
+    turned = Environment(place.medium, place.box, "scene", align=Similarity(matrix))
     rays = crowd(50)
     observers = sample_eye_positions(rays, turned, 4)
     every = rays.origin @ matrix[:3, :3].T + matrix[:3, 3]
@@ -157,7 +157,7 @@ def test_rays_meet_nothing_without_geometry(rgb):
     box = Box((-2.0,) * 3, (2.0,) * 3)
     grid = HashGridConfig(levels=2, log2_rows=8, base=4, finest=8)
     field = GazeField.random(GazeConfig(grid=grid, width=16), box, namespace(rgb.variant()), 1)
-    onlooker = GazeSampler(field, TrainingGeometry(None, box, "none"))
+    onlooker = GazeSampler(field, Environment(None, box, "none"))
     depth, is_hit = onlooker.trace(np.zeros((3, 3)), np.eye(3))
     assert not is_hit.any() and not depth.any()
 

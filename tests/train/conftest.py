@@ -4,8 +4,8 @@ import drjit as dr
 import numpy as np
 import pytest
 
+from nerg_mi.environment.environment import Environment
 from nerg_mi.threads import set_thread_count
-from nerg_mi.train.geometry import TrainingGeometry
 from nerg_mi.transport.volume_medium import VolumeMedium
 from tests.train.gaze.looks import BOX, looking_at
 from tests.train.radiance.ball import ball_dataset
@@ -30,7 +30,7 @@ def wall(rgb):
     data[:, :, 7] = 200
     to_world = rgb.ScalarTransform4f().translate([-2, -2, 0]).scale([4, 4, 3])
     volume = {"type": "gridvolume", "data": rgb.TensorXf(data), "filter_type": "nearest", "to_world": to_world}
-    return TrainingGeometry(VolumeMedium(rgb.load_dict(volume)), BOX, "scene")
+    return Environment(VolumeMedium(rgb.load_dict(volume)), BOX, "scene")
 
 
 @pytest.fixture

@@ -8,11 +8,11 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
+from nerg_mi.environment.environment import load_field_geometry
 from nerg_mi.fields.gaze_base import make_prior_table, table_directions
 from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
 from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.train.geometry import load_field_geometry
 from nerg_mi.transport import observer_batch
 from nerg_mi.transport.geometry import SceneGeometry
 from nerg_mi.transport.march_primal import MarchSettings

@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from nerg_mi.environment.environment import load_volume_geometry
 from nerg_mi.errors import NergError
 from nerg_mi.fields import gaze_hits
 from nerg_mi.fields.encoding import HashGridConfig
@@ -18,7 +19,6 @@ from nerg_mi.fields.mlp import namespace
 from nerg_mi.formats.surfaces import write_volume
 from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.train.geometry import load_volume_geometry
 from nerg_mi.transport.geometry import SceneGeometry, default_march_settings
 from nerg_mi.transport.jit import gc_paused
 from nerg_mi.transport.march_primal import MarchSettings

@@ -14,6 +14,7 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from nerg_mi.environment.environment import load_field_geometry
 from nerg_mi.environment.trained import TrainedField
 from nerg_mi.errors import NergError
 from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid
@@ -28,7 +29,6 @@ from nerg_mi.photos.dataset import open_dataset
 from nerg_mi.photos.structure import Reconstruction
 from nerg_mi.train import compile as compilation
 from nerg_mi.train.compile import compile_field
-from nerg_mi.train.geometry import load_field_geometry
 from nerg_mi.train.radiance_run import train_field
 from nerg_mi.train.radiance_settings import RadianceSettings
 from nerg_mi.workflows import poses as job

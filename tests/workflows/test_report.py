@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from nerg_mi.environment.environment import Environment
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation.gaze_report import write_report
 from nerg_mi.figures.style import make_provenance
@@ -18,7 +19,6 @@ from nerg_mi.files.atomic import file_sha256
 from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.rays.rays import Rays
 from nerg_mi.reports.data import MAX_PATH_POINTS
-from nerg_mi.train.geometry import TrainingGeometry
 from nerg_mi.workflows import report
 from nerg_mi.workflows.gaze_commands import GazeOptions
 from nerg_mi.workflows.report import (
@@ -426,7 +426,7 @@ def test_floor_plans_are_drawn():
 
 
 BOX = Box((0.0, 0.0, 0.0), (8.0, 6.0, 3.0))
-PLACE = TrainingGeometry(None, BOX, "none")
+PLACE = Environment(None, BOX, "none")
 
 
 class Walls:

@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 
+from nerg_mi.environment.environment import identify_file
 from nerg_mi.errors import NergError
 from nerg_mi.figures.overview import PinholeFrame, SeenSurfaces
 from nerg_mi.files.atomic import file_sha256
@@ -17,7 +18,6 @@ from nerg_mi.maths.geometry import Similarity, intersect_box_numpy
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.scene import load_scene
 from nerg_mi.rendering.scene_writer import GazeFiles, Lens, LookAt, SceneContent, SceneText, element, format_document
-from nerg_mi.train.geometry import identify_file
 from nerg_mi.workflows.scene_cameras import (
     SceneProbe,
     check_point,

@@ -11,13 +11,13 @@ import pytest
 
 from nerg_mi.alignment import profile
 from nerg_mi.alignment.check import AlignmentCheck
+from nerg_mi.environment.environment import Environment
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation.study import list_rows, measure_rows
 from nerg_mi.evaluation.study_subject import open_subject
 from nerg_mi.maths.geometry import Box
 from nerg_mi.rays.rays import Rays
 from nerg_mi.train import geometry_files as geometry
-from nerg_mi.train.geometry import TrainingGeometry
 from nerg_mi.train.geometry_files import check_geometry
 from nerg_mi.workflows import align as alignment
 from nerg_mi.workflows import demo, study
@@ -257,7 +257,7 @@ def test_turn_and_shift_hold_with_pairs(tmp_path):
 
 def place(alignment_check, monkeypatch):
     monkeypatch.setattr(geometry, "check_alignment", lambda *_: alignment_check)
-    return TrainingGeometry(object(), Box((0, 0, 0), (1, 1, 1)), "field")  # pyright: ignore[reportArgumentType] # unused argument
+    return Environment(object(), Box((0, 0, 0), (1, 1, 1)), "field")  # pyright: ignore[reportArgumentType] # unused argument
 
 
 def test_gaze_that_hits_no_surface_is_refused_and_doubts_are_reported(monkeypatch):

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.cli import main
+from nerg_mi.environment.environment import Environment, load_scene_geometry
 from nerg_mi.errors import NergError
 from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.gaze_log_density import LogGazeConfig
@@ -23,7 +24,6 @@ from nerg_mi.train.gaze_data import compute_surface_distances
 from nerg_mi.train.gaze_log_density import LikelihoodTrainer, get_geometry_options
 from nerg_mi.train.gaze_recipes import Recipe, register_recipe
 from nerg_mi.train.gaze_settings import ProbeSettings
-from nerg_mi.train.geometry import TrainingGeometry, load_scene_geometry
 from nerg_mi.workflows import train_gaze as module
 from nerg_mi.workflows.gaze_commands import GazeOptions
 from nerg_mi.workflows.train_gaze import check_plan, plan_gaze, train_gaze
@@ -296,7 +296,7 @@ def test_an_output_is_locked_during_training(tmp_path, train):
 HITS = GazeOptions(geometry="hits")
 FIELD = GazeOptions(field=Path("field.safetensors"), recipe="small")
 VIEWS = GazeOptions(geometry="none", views=Path("photos"), salience="maps")
-SCENE = TrainingGeometry(None, BOX, "scene")
+SCENE = Environment(None, BOX, "scene")
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import drjit.llvm.ad as ns
 import numpy as np
 
+from nerg_mi.environment.environment import Environment
 from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.gaze_log_density import LogGazeConfig
 from nerg_mi.fields.gaze_product import GazeConfig
@@ -18,14 +19,13 @@ from nerg_mi.train.gaze_product import ProductTrainer
 from nerg_mi.train.gaze_run import train_gaze
 from nerg_mi.train.gaze_settings import GazeSettings, ProbeSettings
 from nerg_mi.train.gaze_trainer import GazePlan, StateSettings
-from nerg_mi.train.geometry import TrainingGeometry
 
 BOX = Box((-2, -2, 0), (2, 2, 3))
 GRID = HashGridConfig(levels=2, log2_rows=10, base=4, finest=8)
 SMALL = GazeConfig(grid=GRID, width=16, geometry=4)
 LOG = LogGazeConfig(grid=HashGridConfig(levels=2, log2_rows=10, base=2, finest=4), width=16, prior=16, mix=0.1)
 PROBES = ProbeSettings(radius=0.5, count=16, cap=64, min_rays=8, kappa=20.0, directions=64)
-NOWHERE = TrainingGeometry(None, BOX, "none")
+NOWHERE = Environment(None, BOX, "none")
 PRODUCT = GazeSettings(steps=16, num_validations=8, zones=2, validation_probes=6, probes=4, directions=32)
 LIKELIHOOD = GazeSettings(
     steps=16,

@@ -10,6 +10,8 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
+from nerg_mi.environment.environment import DEFAULT_DEPTH as NOWHERE_FAR
+from nerg_mi.environment.environment import Environment, load_field_geometry
 from nerg_mi.errors import NergError
 from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.gaze_base import interpolate_table, table_directions
@@ -55,8 +57,6 @@ from nerg_mi.train.gaze_product import (
     match_trunk_config,
 )
 from nerg_mi.train.gaze_settings import GazeSettings, ProbeSettings
-from nerg_mi.train.geometry import DEFAULT_DEPTH as NOWHERE_FAR
-from nerg_mi.train.geometry import TrainingGeometry, load_field_geometry
 from nerg_mi.transport.field_medium import FieldMedium
 from nerg_mi.transport.geometry import default_march_settings
 from tests.fields.gaze.test_log_density import SMALL as VIEW_TARGETS_SMALL
@@ -172,9 +172,7 @@ def test_prior_is_in_the_frame_of_the_geometry():
     """All look along x, which is y in a geometry rotated by a quarter turn."""
     direction = np.tile([1.0, 0, 0], (10, 1))
     rays = Rays(np.arange(10.0), np.zeros(10), ("a",), np.zeros((10, 3)), direction, np.ones(10))
-    turned = TrainingGeometry(
-        None, BOX, "none", align=Similarity([[0, -3, 0, 1], [3, 0, 0, 2], [0, 0, 3, 0], [0, 0, 0, 1]])
-    )
+    turned = Environment(None, BOX, "none", align=Similarity([[0, -3, 0, 1], [3, 0, 0, 2], [0, 0, 3, 0], [0, 0, 0, 1]]))
     for place, towards in ((None, (1, 0, 0)), (turned, (0, 1, 0))):
         peak = table_directions(32)[np.argmax(make_prior_from_rays(rays, 32, place).ravel())]
         assert peak @ towards > 0.99
@@ -283,7 +281,7 @@ def gaze_config(radiance, variant="emit_capture", **options):
 
 
 def place_of(field):
-    return TrainingGeometry(FieldMedium(field), BOX, "field", radiance=field)
+    return Environment(FieldMedium(field), BOX, "field", radiance=field)
 
 
 @pytest.fixture
@@ -439,7 +437,7 @@ def test_a_quarter_of_the_views_must_remain():
 
 
 def test_validation_zones_use_all_rays_around_them():
-    double = TrainingGeometry(None, BOX, "none", align=Similarity(np.diag([2.0, 2, 2, 1])))
+    double = Environment(None, BOX, "none", align=Similarity(np.diag([2.0, 2, 2, 1])))
     settings = GazeSettings(steps=1, zones=2, validation_probes=6)
     for place in (NOWHERE, double):
         observers = place.points_to_field(RAYS.origin[::60])
@@ -469,9 +467,7 @@ def test_views_alone_are_split_for_validation():
 
 def test_the_support_is_of_all_rays_in_the_frame_of_the_place():
     rays = looking_at((1.5, 0, 1.2))
-    double = TrainingGeometry(
-        None, BOX, "none", align=Similarity([[2, 0, 0, 1], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]])
-    )
+    double = Environment(None, BOX, "none", align=Similarity([[2, 0, 0, 1], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]))
     plain, moved = (Supervision(rays).make_support(0.5, place) for place in (NOWHERE, double))
     assert plain.radius == 0.5 and moved.radius == pytest.approx(1.0)  # noqa: RUF069 (stored)
     assert plain.cells[:, 3].sum() == moved.cells[:, 3].sum() == 400

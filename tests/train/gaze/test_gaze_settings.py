@@ -9,6 +9,7 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
+from nerg_mi.environment.environment import Environment
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation import metrics
 from nerg_mi.fields.gaze_product import GazeConfig, GazeField
@@ -18,7 +19,6 @@ from nerg_mi.train.gaze_product import make_gaze_config
 from nerg_mi.train.gaze_recipes import DEFAULT_RECIPE, FieldOptions, get_recipe, load_recipes, register_recipe
 from nerg_mi.train.gaze_settings import CODE, LOSSES, PAPER, GazeSettings
 from nerg_mi.train.gaze_trainer import KLD_EPS, compute_gaze_loss
-from nerg_mi.train.geometry import TrainingGeometry
 
 from .looks import BOX, NOWHERE
 
@@ -157,8 +157,8 @@ def test_the_papers_size_is_the_papers():
 
 # ---- Recipes: what they make of choices and places, and what they take ----
 
-HITS = TrainingGeometry(None, BOX, "hits")
-SCENE = TrainingGeometry(None, BOX, "scene")
+HITS = Environment(None, BOX, "hits")
+SCENE = Environment(None, BOX, "scene")
 
 
 def test_three_recipes_exist():

@@ -1,4 +1,4 @@
-"""Tests of `nerg_mi.train.geometry`."""
+"""Tests of `nerg_mi.environment.environment`."""
 
 from __future__ import annotations
 
@@ -9,6 +9,23 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
+from nerg_mi.environment.environment import (
+    Environment,
+    load_field_geometry,
+    load_scene_geometry,
+    load_volume_geometry,
+    make_hit_geometry,
+    no_geometry,
+)
+from nerg_mi.environment.hits import (
+    DEFAULT_VOXEL,
+    PADDING_VOXELS,
+    HitExtent,
+    compute_hit_extent,
+    make_volume_dict,
+    shade_hits,
+    voxelise_hits,
+)
 from nerg_mi.errors import NergError
 from nerg_mi.fields.splats import Splats, concatenate_splats
 from nerg_mi.formats.splats import write_ply_splats
@@ -16,21 +33,6 @@ from nerg_mi.formats.surfaces import write_volume
 from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.scene import list_scene_files
-from nerg_mi.train.geometry import (
-    DEFAULT_VOXEL,
-    PADDING_VOXELS,
-    HitExtent,
-    TrainingGeometry,
-    compute_hit_extent,
-    load_field_geometry,
-    load_scene_geometry,
-    load_volume_geometry,
-    make_hit_geometry,
-    make_volume_dict,
-    no_geometry,
-    shade_hits,
-    voxelise_hits,
-)
 from nerg_mi.transport.geometry import trace_depth
 from nerg_mi.transport.volume_medium import VolumeMedium
 from tests.formats.splats.writers import random_splats
@@ -93,7 +95,7 @@ def test_the_box_of_an_office_is_the_room(rays_hit_extent, extent):
 
 def test_depths_in_an_office(rgb, rays_hit_extent, extent, tmp_path, monkeypatch):
     """Surfaces inside the room are at their position; outside surfaces are on the shell, in the right direction."""
-    monkeypatch.setattr("nerg_mi.train.geometry.compute_hit_extent", lambda *_: extent)
+    monkeypatch.setattr("nerg_mi.environment.environment.compute_hit_extent", lambda *_: extent)
     place = make_hit_geometry(rays_hit_extent, tmp_path / "office.vol")
     assert place.metadata["geometry_file"]["beyond"] == pytest.approx(extent.outside_fraction, abs=1e-4)
     seen = office(4000, seed=1)  # rays that were not used for the volume
@@ -285,7 +287,7 @@ def test_truncated_volumes_are_refused(rgb, volume, size):
 def test_frames_of_rays_and_geometry():
     """Twice the size, a quarter turn about z, and shifted."""
     align = Similarity([[0, -2, 0, 1], [2, 0, 0, 2], [0, 0, 2, 3], [0, 0, 0, 1]])
-    place = TrainingGeometry(None, Box((0, 0, 0), (1, 1, 1)), "none", align=align)
+    place = Environment(None, Box((0, 0, 0), (1, 1, 1)), "none", align=align)
     np.testing.assert_allclose(place.points_to_field(np.array([[1.0, 0, 0], [0, 1, 1]])), [[1, 4, 3], [-1, 2, 5]])
     d = np.array([[[0.6, 0.8, 0], [0, 0, 1.0]]])
     turned = place.directions_to_field(d)

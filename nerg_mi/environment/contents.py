@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nerg_mi.environment.trained import TrainedField
 from nerg_mi.errors import NergError, clean_text, translate_mitsuba_errors
 from nerg_mi.fields.splats import Splats
 from nerg_mi.files.atomic import make_folder, replace_atomically, write_text
@@ -41,6 +40,8 @@ from nerg_mi.rendering.scene_writer import (
     relative_path,
     transform,
 )
+
+from .trained import TrainedField
 
 if TYPE_CHECKING:
     import trimesh
