@@ -245,9 +245,9 @@ class MappedRows:
         """Warn if matrices may be transposed, which only their positions show, and if all angles that were read as
         degrees are so small that they are probably radians."""
         if self._turns and not self._moves:
-            first, second = self.pose_columns[:2]
+            names = ", ".join(sanitize(name, 40) for name in self.pose_columns[:2])
             builder.add_warning(
-                f"the matrices {sanitize(first, 40)}, {sanitize(second, 40)}, ... turn, but all their positions are "
+                f"the matrices {names}, ... turn, but all their positions are "
                 "0, 0, 0: if they are written column by column, name their columns row by row (--map matrix=); "
                 "otherwise the heads stay at the origin"
             )
