@@ -1,11 +1,11 @@
-"""Encodings of positions and directions for networks: protocol, registry, and the hash grid."""
+"""Encodings of directions (spherical harmonics) and positions (hash grid) for networks."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from types import ModuleType
-from typing import Any, ClassVar, Protocol, cast
+from typing import Any, ClassVar
 
 import drjit as dr
 import numpy as np
@@ -27,171 +27,6 @@ def encode_direction(d, degree: int = 4) -> list:
     return list(dr.sh_eval(d, degree - 1))
 
 
-# ---- Protocol of position encodings ----
-#
-# An encoding maps a point of the unit cube (or, with two dimensions, of the unit square) to ``config.size`` numbers,
-# the inputs of a network. A field stores it as ``grid`` and names its parameters ``grid.NAME``, like checkpoints.
-#
-# To add an encoding, write one module: a frozen dataclass of its sizes that implements `EncodingConfig`, a class that
-# implements `Encoding`, and a call of :func:`nerg_mi.fields.encoding.register`. Inherit from both protocols for their
-# default methods.
-
-
-class EncodingConfig(Protocol):
-    """Sizes of an encoding: a frozen dataclass of JSON values, whose constructor raises ``ValueError`` for invalid
-    ones.
-
-    Encodings with equal configurations are interchangeable.
-    """
-
-    kind: ClassVar[str]  # Name of the encoding in checkpoints
-    # Maximum values that are read from a file, for integer sizes by name.
-    max_sizes: ClassVar[Mapping[str, int]]
-
-    @property
-    def dimensions(self) -> int:
-        """Coordinates of a point, 2 or 3."""
-        ...
-
-    @property
-    def size(self) -> int:
-        """Number of features per point."""
-        ...
-
-    @property
-    def finest(self) -> float:
-        """Maximum resolution: cells along an edge of the unit cube."""
-        ...
-
-    def parameter_shapes(self) -> dict[str, tuple[int, ...]]:
-        """Shapes of the parameters by name: flat arrays (Float) have one axis, tensors (TensorXf) more."""
-        ...
-
-    def describe(self) -> str:
-        """The sizes in a few words."""
-        ...
-
-    def to_dict(self) -> dict[str, Any]:
-        """The JSON object for a checkpoint; `config_from_dict` is the inverse."""
-        return {"kind": self.kind, **asdict(self)}  # pyright: ignore[reportArgumentType] it is a dataclass
-
-
-class Encoding(Protocol):
-    """Trainable features at points of the unit cube.
-
-    The constructor takes ``config``, the parameters by name, and ``mode``: how gradients are accumulated into the
-    parameters (``Expand``, a copy for each thread, costs a fraction of atomics for large batches). It raises
-    ``ValueError`` if the shapes of parameters do not match ``config``. Each parameter is an attribute of its name and
-    an entry of ``DRJIT_STRUCT``, so that Dr.Jit finds it in frozen functions and loops.
-    """
-
-    DRJIT_STRUCT: ClassVar[dict[str, Any]]
-    config: Any
-    mode: dr.ReduceMode
-
-    @classmethod
-    def random(cls, config: Any, ns: ModuleType, rng: np.random.Generator) -> Encoding:
-        """An untrained encoding of backend ``ns``; equal states of ``rng`` give equal parameters."""
-        ...
-
-    def __call__(self, p: Array3f, active: Bool | bool = True) -> list[Float]:
-        """``config.size`` Floats at ``p`` (Array3f or Array2f in the unit cube or square).
-
-        Zeros where ``p`` is outside or not ``active``. Gradients reach the parameters and ``p``.
-        """
-        ...
-
-    def evaluate_eagerly(self, p: Array3f, active: Bool | bool = True) -> list[Float]:
-        """The same features, evaluated into memory, for many points at once; an encoding can have a faster
-        implementation."""
-        out = self(p, active)
-        dr.eval(out)
-        return out
-
-    def attach(self, features: list[Float], p: Array3f) -> list[Float]:
-        """``features``, evaluated earlier at ``p``, with the derivatives by the parameters alone.
-
-        An encoding can have a faster implementation.
-        """
-        rows = self(dr.detach(p))
-        return [cast("Float", dr.replace_grad(value, row)) for value, row in zip(features, rows)]
-
-    def named(self) -> dict[str, Any]:
-        """The parameters by name."""
-        return {name: getattr(self, name) for name in self.config.parameter_shapes()}
-
-    def replace(self, name: str, value: Any) -> None:
-        """Replace the parameter ``name`` by ``value`` of the same shape; takes effect with `pack`."""
-        setattr(self, name, value)
-
-    def pack(self) -> None:
-        """Update what the kernels read, if that is not the parameters themselves; gradients flow through."""
-
-    def kernel_parameters(self) -> list:
-        """The flat arrays that evaluations read, attached to the parameters."""
-        return [value.array for value in self.named().values()]
-
-    def check_config(self, config: Any) -> None:
-        """Raise ``ValueError`` unless this is an encoding of ``config``."""
-        if self.config != config:
-            raise ValueError(f"this grid has the configuration {self.config}, but its field needs {config}")
-
-
-# ---- Registry ----
-#
-# Position encodings by their name in files and by the type of their configuration.
-
-DEFAULT_KIND = "hashgrid"
-"""The encoding of a configuration without a kind in a file, as earlier versions wrote it."""
-
-_CONFIGS: dict[str, type[EncodingConfig]] = {}
-_ENCODINGS: dict[type[EncodingConfig], type[Encoding]] = {}
-
-
-def register(config: type[EncodingConfig], encoding: type[Encoding]) -> None:
-    """Register the type ``config`` of configurations for encodings of the type ``encoding``.
-
-    Raises ``ValueError`` if another type has the same kind.
-    """
-    if _CONFIGS.get(config.kind, config) is not config:
-        raise ValueError(f'the kind "{config.kind}" is already registered for {_CONFIGS[config.kind].__name__}')
-    _CONFIGS[config.kind], _ENCODINGS[config] = config, encoding
-
-
-def kinds() -> tuple[str, ...]:
-    """The registered kinds."""
-    return tuple(_CONFIGS)
-
-
-def config_type(data: Mapping[str, Any]) -> type[EncodingConfig]:
-    """The type of the configuration in the JSON object ``data``. Raises ``ValueError`` for an unknown kind."""
-    kind = data.get("kind", DEFAULT_KIND)
-    if not isinstance(kind, str) or kind not in _CONFIGS:
-        raise ValueError(
-            f"its positions are encoded by {str(kind)[:40]!r}, which this version does not know; known encodings: "
-            f"{', '.join(_CONFIGS)}"
-        )
-    return _CONFIGS[kind]
-
-
-def config_from_dict(data: Mapping[str, Any]) -> EncodingConfig:
-    """The inverse of ``to_dict``. Raises ``ValueError`` or ``TypeError`` for invalid data."""
-    return config_type(data)(**{k: v for k, v in data.items() if k != "kind"})
-
-
-def init_encoding(config: EncodingConfig, ns: ModuleType, rng: np.random.Generator) -> Encoding:
-    """An untrained encoding of ``config`` on backend ``ns``."""
-    return _ENCODINGS[type(config)].random(config, ns, rng)
-
-
-def encoding_from_parameters(
-    config: EncodingConfig, parameters: Mapping[str, Any], name: str = "grid", mode: dr.ReduceMode = dr.ReduceMode.Auto
-) -> Encoding:
-    """The encoding of ``config`` with the entries ``NAME.PARAMETER`` of ``parameters``; see `Encoding`."""
-    arrays = {key: parameters[f"{name}.{key}"] for key in config.parameter_shapes()}
-    return _ENCODINGS[type(config)](config, **arrays, mode=mode)  # pyright: ignore[reportCallIssue] as `Encoding` says
-
-
 # ---- Multiresolution hash grid (Müller et al. 2022, "Instant Neural Graphics Primitives") ----
 #
 # The memory layout is torch-ngp's, so that its checkpoints load without loss: a vertex stride of resolution + 1 on
@@ -203,10 +38,10 @@ _PRIMES = (1, 2654435761, 805459861)
 
 
 @dataclass(frozen=True)
-class HashGridConfig(EncodingConfig):
+class HashGridConfig:
     """Sizes of a hash grid. Resolutions grow geometrically from the coarsest level to the finest."""
 
-    kind: ClassVar[str] = DEFAULT_KIND
+    # Maximum values that are read from a file, by name.
     max_sizes: ClassVar[Mapping[str, int]] = {
         "levels": 64,
         "features": 4,
@@ -241,13 +76,29 @@ class HashGridConfig(EncodingConfig):
         return self.levels * self.features
 
     def parameter_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shapes of the parameters by name."""
         return {"table": (self.offsets()[-1] * self.features,)}
 
     def describe(self) -> str:
+        """The sizes in a few words."""
         return f"{self.levels} x {self.features}, 2^{self.log2_rows} rows, {self.base} to {self.finest}"
 
     def to_dict(self) -> dict[str, Any]:
-        return asdict(self)  # Without a kind, so that all earlier versions can read hash grids
+        """The JSON object for a checkpoint."""
+        return asdict(self)
+
+    @staticmethod
+    def check_kind(data: Mapping[str, Any]) -> None:
+        """Raise ``ValueError`` unless the JSON object ``data`` describes a hash grid."""
+        if data.get("kind", "hashgrid") != "hashgrid":
+            kind = str(data["kind"])[:40]
+            raise ValueError(f"its positions are encoded by {kind!r}, which this version does not know")
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> HashGridConfig:
+        """The inverse of `to_dict`. Raises ``ValueError`` or ``TypeError`` for invalid data."""
+        cls.check_kind(data)
+        return cls(**{k: v for k, v in data.items() if k != "kind"})
 
     def level_scales(self) -> np.ndarray:
         """Scale of each level as float32, (levels,): ``exp2(l log2 s) base - 1``."""
@@ -270,11 +121,12 @@ class HashGridConfig(EncodingConfig):
         return [0, *np.cumsum(self.level_rows()).tolist()]
 
 
-class HashGrid(Encoding):
+class HashGrid:
     """Trainable features at points of the unit cube.
 
     ``table`` is the flat parameter array (Float), (rows * features,), with adjacent features of a row and consecutive
-    levels; ``mode`` as for `Encoding`.
+    levels. ``mode`` states how gradients are accumulated into it: ``Expand``, a copy for each thread, costs a fraction
+    of atomics for large batches.
     """
 
     DRJIT_STRUCT: ClassVar[dict[str, Any]] = {"table": None}
@@ -293,6 +145,30 @@ class HashGrid(Encoding):
         """A grid with entries uniform in ``[-scale, scale]``."""
         (size,) = config.parameter_shapes()["table"]
         return cls(config, ns.Float(rng.uniform(-scale, scale, size).astype(np.float32)))
+
+    @classmethod
+    def from_parameters(
+        cls,
+        config: HashGridConfig,
+        parameters: Mapping[str, Any],
+        name: str = "grid",
+        mode: dr.ReduceMode = dr.ReduceMode.Auto,
+    ) -> HashGrid:
+        """The grid of ``config`` with the entry ``NAME.table`` of ``parameters``."""
+        return cls(config, parameters[f"{name}.table"], mode)
+
+    def named(self) -> dict[str, Any]:
+        """The parameters by name."""
+        return {"table": self.table}
+
+    def replace(self, name: str, value: Any) -> None:
+        """Replace the parameter ``name`` by ``value`` of the same shape."""
+        setattr(self, name, value)
+
+    def check_config(self, config: HashGridConfig) -> None:
+        """Raise ``ValueError`` unless this is a grid of ``config``."""
+        if self.config != config:
+            raise ValueError(f"this grid has the configuration {self.config}, but its field needs {config}")
 
     def is_hashed(self, level: int) -> bool:
         """Whether the vertices of ``level`` exceed its rows."""
@@ -423,6 +299,3 @@ class _TableDerivatives(dr.CustomOp):
 
     def name(self):
         return "hash grid"
-
-
-register(HashGridConfig, HashGrid)

@@ -17,7 +17,7 @@ from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.maths.types import Bool, Float, Point3f, Vector3f
 from nerg_mi.ranges import MAX_COORDINATE
 
-from .encoding import Encoding, EncodingConfig, config_from_dict
+from .encoding import HashGrid, HashGridConfig
 from .gaze_hits import ReaimedHits
 from .mlp import MLP, namespace
 from .radiance import assign_parameters
@@ -182,7 +182,7 @@ class Arrays(Protocol):
         """The float32 array ``name`` of this ``shape`` (None: any length), with absolute values up to ``max_value``."""
         ...
 
-    def build_grid(self, config: EncodingConfig, name: str = "grid") -> Encoding:
+    def build_grid(self, config: HashGridConfig, name: str = "grid") -> HashGrid:
         """The encoding of ``config``."""
         ...
 
@@ -309,7 +309,7 @@ class GazeHeadConfig:
     @classmethod
     def from_dict(cls, d: dict) -> Self:
         """The inverse of `to_dict`."""
-        return cls(**{**{k: v for k, v in d.items() if k != "kind"}, "grid": config_from_dict(d["grid"])})
+        return cls(**{**{k: v for k, v in d.items() if k != "kind"}, "grid": HashGridConfig.from_dict(d["grid"])})
 
 
 def check_choices(config: GazeHeadConfig, **words: tuple[str, ...]) -> None:
@@ -367,7 +367,7 @@ class GazeHead(AnyGazeField):
         self.pack()
 
     def pack(self) -> None:
-        for name in ("grid", *self.NETS):
+        for name in self.NETS:
             getattr(self, name).pack()
 
     def unnormalized(

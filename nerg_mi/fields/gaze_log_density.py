@@ -24,7 +24,7 @@ from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.maths.types import Bool
 from nerg_mi.ranges import LENGTHS, MAX_COORDINATE
 
-from .encoding import Encoding, EncodingConfig, HashGridConfig, encode_direction, init_encoding
+from .encoding import HashGrid, HashGridConfig, encode_direction
 from .gaze_base import MAX_SIZES, Arrays, GazeHead, GazeHeadConfig, check_choices, register
 from .gaze_product import VARIANTS
 from .mlp import MLP
@@ -43,7 +43,7 @@ class LogGazeConfig(GazeHeadConfig):
     kind: ClassVar[str] = "log_density"
 
     # Encoding of emit, over the field's box; coarse levels generalise to unvisited positions.
-    grid: EncodingConfig = field(default_factory=lambda: HashGridConfig(levels=3, log2_rows=14, base=2, finest=8))
+    grid: HashGridConfig = field(default_factory=lambda: HashGridConfig(levels=3, log2_rows=14, base=2, finest=8))
     variant: str = "emit_capture"  # As in `GazeConfig`
     width: int = 64  # Neurons of each hidden layer, in both networks
     layers: int = 2  # Hidden layers of both networks
@@ -112,7 +112,7 @@ class LogGazeField(GazeHead):
     fixed: ClassVar[tuple[str, ...]] = ("prior",)
 
     def __init__(
-        self, config: LogGazeConfig, box: AnyBox, grid: Encoding, emit_net: MLP, capture_net: MLP, escaped, prior
+        self, config: LogGazeConfig, box: AnyBox, grid: HashGrid, emit_net: MLP, capture_net: MLP, escaped, prior
     ):
         grid.check_config(config.grid)
         emit_net.check_sizes(config.emit_sizes, "emit_net")
@@ -138,7 +138,7 @@ class LogGazeField(GazeHead):
         return LogGazeField(
             config,
             box,
-            init_encoding(config.grid, ns, rng),
+            HashGrid.random(config.grid, ns, rng),
             MLP.random(config.emit_sizes, ns, rng),
             MLP.random(config.capture_sizes, ns, rng),
             ns.Float(0.0),

@@ -19,7 +19,7 @@ from nerg_mi.maths.arrays import log1p, sigmoid
 from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.maths.types import Bool
 
-from .encoding import Encoding, EncodingConfig, HashGridConfig, encode_direction, init_encoding
+from .encoding import HashGrid, HashGridConfig, encode_direction
 from .gaze_base import Arrays, GazeHead, GazeHeadConfig, check_choices, register
 from .mlp import MLP
 
@@ -57,7 +57,7 @@ class GazeConfig(GazeHeadConfig):
     kind: ClassVar[str] = "product"
 
     # The encoding of positions, over the field's box.
-    grid: EncodingConfig = field(default_factory=lambda: HashGridConfig(finest=512))
+    grid: HashGridConfig = field(default_factory=lambda: HashGridConfig(finest=512))
     # emit: depends on the surface only; capture: on the observer only, through a sigmoid; emit_capture: the product.
     variant: str = "emit_capture"
     # Of the emit head: softplus and exp give densities; linear is the paper's and can be negative.
@@ -124,7 +124,7 @@ class GazeField(GazeHead):
         self,
         config: GazeConfig,
         box: AnyBox,
-        grid: Encoding,
+        grid: HashGrid,
         position_net: MLP,
         direction_net: MLP,
         emit_head: MLP,
@@ -153,7 +153,7 @@ class GazeField(GazeHead):
     def random(config: GazeConfig, box: AnyBox, ns: ModuleType, seed: int = 0) -> GazeField:
         """An untrained field of backend ``ns``; equal seeds give equal weights."""
         rng = np.random.default_rng(seed)
-        grid = init_encoding(config.grid, ns, rng)
+        grid = HashGrid.random(config.grid, ns, rng)
         is_normalized = GazeField._is_normalized
         nets = {
             name: MLP.random(sizes, ns, rng, is_normalized(config, name))

@@ -15,7 +15,7 @@ from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.maths.types import Bool, Float
 from nerg_mi.ranges import MAX_COORDINATE, POSITIVE_VALUES
 
-from .encoding import Encoding, EncodingConfig, HashGridConfig, config_from_dict, encode_direction, init_encoding
+from .encoding import HashGrid, HashGridConfig, encode_direction
 from .mlp import MLP, namespace
 from .occupancy import CascadeGrid, OccupancyGrid, RefinedGrid
 from .voxels import VoxelGrid
@@ -40,7 +40,7 @@ EMPTY = (
 class GridConfig:
     """Base of frozen dataclasses of sizes with an encoding ``grid``, stored in checkpoints as JSON objects."""
 
-    grid: EncodingConfig
+    grid: HashGridConfig
 
     def to_dict(self) -> dict[str, Any]:
         return {**asdict(self), "grid": self.grid.to_dict()}  # pyright: ignore[reportArgumentType] it is a dataclass
@@ -48,7 +48,7 @@ class GridConfig:
     @classmethod
     def from_dict(cls, d: dict[str, Any]) -> Self:
         """The inverse of ``to_dict``. Raises ``KeyError``, ``TypeError`` or ``ValueError`` for invalid data."""
-        return cls(**{**d, "grid": config_from_dict(d["grid"])})
+        return cls(**{**d, "grid": HashGridConfig.from_dict(d["grid"])})
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class BackgroundConfig(GridConfig):
 
     radius: float  # Radius of the sphere about the field's origin, in the field's units
     # The encoding of both angles.
-    grid: EncodingConfig = field(default_factory=lambda: HashGridConfig(levels=4, dimensions=2))
+    grid: HashGridConfig = field(default_factory=lambda: HashGridConfig(levels=4, dimensions=2))
     width: int = 64  # Neurons of each hidden layer
     hidden: int = 1  # Hidden layers
     sh_degree: int = 4  # Degree of the encoding of directions
@@ -82,7 +82,7 @@ class Background:
 
     DRJIT_STRUCT: ClassVar[dict[str, Any]] = {"grid": None, "net": None}
 
-    def __init__(self, config: BackgroundConfig, grid: Encoding, net: MLP):
+    def __init__(self, config: BackgroundConfig, grid: HashGrid, net: MLP):
         grid.check_config(config.grid)
         net.check_sizes(config.sizes, "background_net")
         self.config, self.grid, self.net = config, grid, net
@@ -91,7 +91,7 @@ class Background:
     def random(config: BackgroundConfig, ns: ModuleType, seed: int = 0) -> Background:
         """An untrained background; equal seeds give equal weights."""
         rng = np.random.default_rng(seed)
-        return Background(config, init_encoding(config.grid, ns, rng), MLP.random(config.sizes, ns, rng))
+        return Background(config, HashGrid.random(config.grid, ns, rng), MLP.random(config.sizes, ns, rng))
 
     def coordinates(self, o, d) -> list:
         """[2 θ / π - 1, φ / π] where the ray ``o + t d`` (unit ``d``) leaves the sphere; θ from +y, φ from +x to +z."""
@@ -187,7 +187,7 @@ _MAX_LOG_DENSITY = 30.0  # exp(30) is 1e13 per unit: opaque at any scale, and fa
 class RadianceConfig(GridConfig):
     """Sizes of the networks. The defaults are the paper's. Raises ``ValueError`` for invalid sizes."""
 
-    grid: EncodingConfig = field(default_factory=HashGridConfig)  # The encoding of positions
+    grid: HashGridConfig = field(default_factory=HashGridConfig)  # The encoding of positions
     width: int = 64  # Neurons of each hidden layer
     density_hidden: int = 1  # Hidden layers of the density net
     color_hidden: int = 2  # Hidden layers of the colour net
@@ -288,7 +288,7 @@ class RadianceField:
         self,
         config: RadianceConfig,
         box: AnyBox,
-        grid: Encoding,
+        grid: HashGrid,
         density_net: MLP,
         color_net: MLP,
         occupancy: OccupancyGrid | RefinedGrid | CascadeGrid | None = None,
@@ -318,7 +318,7 @@ class RadianceField:
         return RadianceField(
             config,
             box,
-            init_encoding(config.grid, ns, rng),
+            HashGrid.random(config.grid, ns, rng),
             MLP.random(config.density_sizes, ns, rng),
             MLP.random(config.color_sizes, ns, rng),
             **kwargs,
@@ -345,7 +345,7 @@ class RadianceField:
         return namespace(self.density_net.weights[0])
 
     @property
-    def background_grid(self) -> Encoding | None:
+    def background_grid(self) -> HashGrid | None:
         """The encoding of the background, named like its parameters."""
         return self.background.grid if self.background is not None else None
 
@@ -369,20 +369,19 @@ class RadianceField:
         self.voxels = None
         if self.occupancy is not None:
             self.occupancy = self.occupancy.coarse
-        for part in (self.grid, self.density_net, self.color_net):
-            part.pack()
+        self.density_net.pack()
+        self.color_net.pack()
         # Depth passes need one output of the last layer, not 1 + geometry of them.
         last = self.density_net.weights[-1]
         self._head = MLP(self.density_net.weights[:-1] + [last[0:1, :]])
         self._head.has_constant_weights = self.density_net.has_constant_weights
         self._head.pack()
         if self.background is not None:
-            self.background.grid.pack()
             self.background.net.pack()
 
     def kernel_parameters(self) -> list:
         """The arrays that evaluations read: the encoding's and the packed networks, attached to ``parameters()``."""
-        networks = [*self.grid.kernel_parameters(), self.density_net.buffer, self.color_net.buffer, self._head.buffer]
+        networks = [self.grid.table, self.density_net.buffer, self.color_net.buffer, self._head.buffer]
         return networks if self.voxels is None else [*networks, *self.voxels.kernel_parameters()]
 
     @property

@@ -14,7 +14,7 @@ from typing import Any, cast
 import numpy as np
 
 from nerg_mi.errors import NergError, sanitize
-from nerg_mi.fields.encoding import Encoding, EncodingConfig, config_type, encoding_from_parameters
+from nerg_mi.fields.encoding import HashGrid, HashGridConfig
 from nerg_mi.fields.gaze_base import (
     MAX_WEIGHT,
     AnyGazeField,
@@ -73,7 +73,7 @@ def check_sizes(config: object, section: str = "architecture", limits: Mapping[s
     """Check the sizes in a JSON configuration and return the configuration.
 
     Raises ``ValueError`` if a size is not an integer within its limits. Missing entries are not checked; the
-    configuration class reports them. The limits of an encoding (``grid``) are those of its kind.
+    configuration class reports them. The limits of a ``grid`` are those of `HashGridConfig`.
 
     Parameters
     ----------
@@ -100,7 +100,9 @@ def check_sizes(config: object, section: str = "architecture", limits: Mapping[s
         )
     if "grid" in config:
         grid = config["grid"]
-        check_sizes(grid, "grid", config_type(grid).max_sizes if isinstance(grid, dict) else {})
+        if isinstance(grid, dict):
+            HashGridConfig.check_kind(grid)
+        check_sizes(grid, "grid", HashGridConfig.max_sizes)
     return config
 
 
@@ -198,12 +200,12 @@ class StoredArrays:
             )
         return value
 
-    def build_grid(self, config: EncodingConfig, name: str = "grid") -> Encoding:
+    def build_grid(self, config: HashGridConfig, name: str = "grid") -> HashGrid:
         """Build the encoding ``name`` with the configuration ``config``."""
         arrays = {
             f"{name}.{key}": self._to_drjit(f"{name}.{key}", *shape) for key, shape in config.parameter_shapes().items()
         }
-        return encoding_from_parameters(config, arrays, name)
+        return HashGrid.from_parameters(config, arrays, name)
 
     def build_network(self, name: str, sizes: list[int], normalized: bool = False) -> MLP:
         """Build the network ``name`` with layers of these ``sizes``; ``normalized``: with the gains and shifts of

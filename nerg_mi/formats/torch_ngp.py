@@ -10,7 +10,7 @@ from types import ModuleType
 import numpy as np
 
 from nerg_mi.errors import NergError, sanitize
-from nerg_mi.fields.encoding import Encoding, HashGrid, HashGridConfig
+from nerg_mi.fields.encoding import HashGrid, HashGridConfig
 from nerg_mi.fields.gaze_product import GazeConfig, GazeField
 from nerg_mi.fields.mlp import MLP
 from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid, count_cascade_levels
@@ -412,7 +412,7 @@ def make_state_dict(field: RadianceField) -> dict[str, np.ndarray]:
     return state
 
 
-def _store_grid(state: dict, name: str, grid: Encoding) -> None:
+def _store_grid(state: dict, name: str, grid: HashGrid) -> None:
     state[f"{name}.embeddings"] = grid.named()["table"].numpy().reshape(-1, grid.config.features)
     state[f"{name}.offsets"] = np.array(grid.config.offsets(), np.int32)
 

@@ -10,7 +10,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from nerg_mi.fields.encoding import Encoding, HashGridConfig, encoding_from_parameters
+from nerg_mi.fields.encoding import HashGrid, HashGridConfig
 from nerg_mi.fields.gaze_base import make_prior_table, table_directions
 from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
 from nerg_mi.fields.gaze_product import softplus
@@ -59,7 +59,7 @@ def evaluate_log_density(
     net = lambda name: MLP([parameters[f"{name}.{i}"] for i in range(config.layers + 1)])
     # The field computes the network inputs.
     field = _Inputs(
-        config, box, encoding_from_parameters(config.grid, parameters, mode=dr.ReduceMode.Expand), parameters["prior"]
+        config, box, HashGrid.from_parameters(config.grid, parameters, mode=dr.ReduceMode.Expand), parameters["prior"]
     )
     repeats = dr.width(r_o) // dr.width(p_o)
     logit = field.log_base(r_o)
@@ -88,7 +88,7 @@ def evaluate_log_density(
 class _Inputs(LogGazeField):
     """A field without networks, used for its inputs."""
 
-    def __init__(self, config: LogGazeConfig, box: AnyBox, grid: Encoding, prior: Any):
+    def __init__(self, config: LogGazeConfig, box: AnyBox, grid: HashGrid, prior: Any):
         self.config, self.box, self.grid, self.prior = config, box, grid, prior
 
 

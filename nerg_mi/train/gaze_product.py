@@ -12,7 +12,7 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.fields.encoding import HashGridConfig, encode_direction, encoding_from_parameters
+from nerg_mi.fields.encoding import HashGrid, HashGridConfig, encode_direction
 from nerg_mi.fields.gaze_product import GazeConfig, GazeField, activate
 from nerg_mi.fields.mlp import MLP
 from nerg_mi.fields.radiance import RadianceConfig, RadianceField
@@ -73,7 +73,7 @@ def evaluate_gaze_density(
         count = sum(k.startswith(name + ".") for k in parameters)
         return MLP([parameters[f"{name}.{i}"] for i in range(count)])
 
-    grid = encoding_from_parameters(config.grid, parameters, mode=dr.ReduceMode.Expand)
+    grid = HashGrid.from_parameters(config.grid, parameters, mode=dr.ReduceMode.Expand)
     position, direction = net("position_net"), net("direction_net")
     repeats = dr.width(r_o) // dr.width(p_o)
 

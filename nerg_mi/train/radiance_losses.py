@@ -10,7 +10,7 @@ from typing import Any, cast
 import drjit as dr
 import numpy as np
 
-from nerg_mi.fields.encoding import encode_direction, encoding_from_parameters
+from nerg_mi.fields.encoding import HashGrid, encode_direction
 from nerg_mi.fields.mlp import MLP
 from nerg_mi.fields.radiance import (
     RadianceConfig,
@@ -310,7 +310,7 @@ def make_density_prepass(config: RadianceConfig, box: AnyBox) -> Callable[..., t
     @dr.freeze
     def evaluate(parameters: dict, head: MLP, p: Array3f, active) -> tuple[Float, list[Float]]:
         with gc_paused():
-            features = encoding_from_parameters(config.grid, parameters).evaluate_eagerly(box.to_unit(p), active)
+            features = HashGrid.from_parameters(config.grid, parameters).evaluate_eagerly(box.to_unit(p), active)
             return box.density_from_encoded(density_from_log(head(features)[0], config.density_scale), p), features
 
     def prepass(parameters: dict, p: Array3f, active) -> tuple[Float, list[Float]]:
@@ -327,7 +327,7 @@ def _make_density_head(parameters: dict) -> MLP:
 
 
 def _evaluate_features(config: RadianceConfig, box: AnyBox, parameters: dict, p, ns, features: list | None = None):
-    grid, p = encoding_from_parameters(config.grid, parameters, mode=dr.ReduceMode.Expand), box.to_unit(p)
+    grid, p = HashGrid.from_parameters(config.grid, parameters, mode=dr.ReduceMode.Expand), box.to_unit(p)
     if features is None:
         with dr.suspend_grad():
             features = grid.evaluate_eagerly(p)

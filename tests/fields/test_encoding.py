@@ -1,23 +1,13 @@
 """Tests of `nerg_mi.fields.encoding`."""
 
 import gc
-from dataclasses import dataclass
 
 import drjit as dr
 import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.fields.encoding import (
-    HashGrid,
-    HashGridConfig,
-    config_from_dict,
-    config_type,
-    encode_direction,
-    encoding_from_parameters,
-    init_encoding,
-    register,
-)
+from nerg_mi.fields.encoding import HashGrid, HashGridConfig, encode_direction
 from nerg_mi.threads import set_thread_count
 from tests.reference import fields_numpy as reference
 from tests.reference import hashgrid_numpy as reference_hashgrid
@@ -287,38 +277,28 @@ def test13_evaluation_leaves_no_reference_cycles():
         gc.enable()
 
 
-# ---- The registry of encodings: kinds in files, and invalid ones ----
+# ---- Configurations in files: with and without a kind, and of unknown kinds ----
 
 CONFIG = HashGridConfig(levels=2, log2_rows=6, base=2, finest=4)
 
 
 def test_configuration_without_kind_is_a_hash_grid():
-    assert config_from_dict(CONFIG.to_dict()) == CONFIG and "kind" not in CONFIG.to_dict()
-    assert config_from_dict({"kind": "hashgrid", **CONFIG.to_dict()}) == CONFIG
-    assert config_type({}) is HashGridConfig
+    assert HashGridConfig.from_dict(CONFIG.to_dict()) == CONFIG and "kind" not in CONFIG.to_dict()
+    assert HashGridConfig.from_dict({"kind": "hashgrid", **CONFIG.to_dict()}) == CONFIG
+    assert HashGridConfig.from_dict({}) == HashGridConfig()
 
 
 @pytest.mark.parametrize("kind", ["permutohedral", 3, None, ["hashgrid"]])
 def test_unknown_kind_is_named(kind):
     with pytest.raises(ValueError, match="version does not know"):
-        config_from_dict({"kind": kind})
-
-
-def test_duplicate_kind_is_refused():
-    @dataclass(frozen=True)
-    class Other(HashGridConfig):
-        pass
-
-    with pytest.raises(ValueError, match='"hashgrid"'):
-        register(Other, HashGrid)
-    register(HashGridConfig, HashGrid)
+        HashGridConfig.from_dict({"kind": kind})
 
 
 def test_encoding_from_configuration():
-    grid = init_encoding(CONFIG, ns, np.random.default_rng(1))
+    grid = HashGrid.random(CONFIG, ns, np.random.default_rng(1))
     same = HashGrid.random(CONFIG, ns, np.random.default_rng(1))
     assert np.array_equal(grid.table.numpy(), same.table.numpy())
     parameters = {"behind.table": grid.table, "grid.table": grid.table * 0}
-    result = encoding_from_parameters(CONFIG, parameters, "behind", dr.ReduceMode.Expand)
+    result = HashGrid.from_parameters(CONFIG, parameters, "behind", dr.ReduceMode.Expand)
     assert result.table is grid.table and result.mode == dr.ReduceMode.Expand
-    assert not encoding_from_parameters(CONFIG, parameters).table.numpy().any()
+    assert not HashGrid.from_parameters(CONFIG, parameters).table.numpy().any()

@@ -8,7 +8,7 @@ import numpy as np
 
 from nerg_mi.maths.arrays import sigmoid
 
-from .encoding import EncodingConfig, HashGridConfig, encode_direction, init_encoding
+from .encoding import HashGrid, HashGridConfig, encode_direction
 from .gaze_base import GazeHead, GazeHeadConfig, register
 from .mlp import MLP
 
@@ -16,7 +16,7 @@ from .mlp import MLP
 @dataclass(frozen=True)
 class PlaceConfig(GazeHeadConfig):
     kind: ClassVar[str] = "place"
-    grid: EncodingConfig = field(default_factory=lambda: HashGridConfig(levels=2, log2_rows=8, base=2, finest=4))
+    grid: HashGridConfig = field(default_factory=lambda: HashGridConfig(levels=2, log2_rows=8, base=2, finest=4))
     variant: str = "emit_capture"
     width: int = 16
     prior: int = 16
@@ -36,7 +36,7 @@ class PlaceField(GazeHead):
     def random(cls, config, box, ns, seed, prior):
         rng, sizes = np.random.default_rng(seed), ([config.grid.size, config.width, 1], [9, config.width, 1])
         nets = (MLP.random(layers, ns, rng) for layers in sizes)
-        return cls(config, box, init_encoding(config.grid, ns, rng), *nets, ns.TensorXf(np.float32(prior)))
+        return cls(config, box, HashGrid.random(config.grid, ns, rng), *nets, ns.TensorXf(np.float32(prior)))
 
     @classmethod
     def from_arrays(cls, architecture, box, arrays):
