@@ -17,6 +17,7 @@ from typing import Any, TypeAlias
 # A message names a parameter by `parameter`, between characters that no text contains. It is spelled where the message
 # is shown: as ``steps=200`` in Python, and as ``--steps 200`` on the command line.
 
+_MARKS = "\ue000\ue001\ue002"
 _MENTION = re.compile("\ue000(\\w+)\ue001([^\ue002]*)\ue002")
 Spelling: TypeAlias = Callable[[str, str], str]
 """Spells a parameter, of its name and a value; the value is "" if only the parameter is meant."""
@@ -30,12 +31,16 @@ def parameter(name: str, value: object = "") -> str:
 def spell_python(name: str, value: str) -> str:
     """Spell a parameter as a keyword argument: ``steps=200``, ``recipe="small"``."""
     is_word = value.isidentifier() and not value.isupper() and value not in ("True", "False", "None")
-    return "=".join([name, *([f'"{value}"' if is_word else value] if value else ())])
+    text = f'"{value}"' if is_word or "=" in value or "{" in value else value
+    return f"{name}={text}" if value else name
 
 
-def spell_command_line(name: str, value: str) -> str:
-    """Spell a parameter as an option: ``--steps 200``; True is the option alone."""
-    return " ".join([f"--{name.replace('_', '-')}", *([value] if value not in ("", "True") else ())])
+def spell_command_line(name: str, value: str, flag: str = "") -> str:
+    """Spell a parameter as an option, by default that of its name: ``--steps 200``, ``--resume``, ``--no-depth``."""
+    flag = flag or f"--{name.replace('_', '-')}"
+    if value == "False":
+        return f"--no-{flag[2:]}"
+    return flag if value in ("", "True") else f"{flag} {value}"
 
 
 def spell_parameters(text: str, spelling: Spelling = spell_python) -> str:
@@ -78,7 +83,7 @@ class NergError(ValueError):
         return dict(_MENTION.findall(self.message))
 
     def __str__(self) -> str:
-        return clean_text(spell_parameters(super().__str__()))
+        return clean_text(super().__str__())
 
 
 class MissingFile(NergError, FileNotFoundError):
@@ -91,9 +96,9 @@ class UnusableLLVM(ImportError):
 
 @contextmanager
 def blame_options(options: str) -> Iterator[None]:
-    """Attribute each `ValueError` of the block to the command-line ``options`` ("--aabb"), as a `NergError`.
+    """Attribute each `ValueError` of the block to ``options``, which mention parameters, as a `NergError`.
 
-    Internal functions raise `ValueError` for invalid values because they do not know which option supplied them.
+    Internal functions raise `ValueError` for invalid values because they do not know which parameter supplied them.
     """
     try:
         yield
@@ -213,13 +218,13 @@ def translate_mitsuba_errors(file: str | PathLike[str] | None = None) -> Iterato
 
 
 def format_error(error: BaseException) -> str:
-    """Return the message of ``error`` on one line.
+    """Return the message of ``error`` on one line; `clean_text` spells the parameters that it mentions.
 
     Mitsuba embeds the complete Python traceback of a plugin's constructor in its message, and the class of its
     exception. The returned line keeps the location in the scene (the text before the traceback) and the message of the
     exception (its last line).
     """
-    text = str(error).strip()
+    text = (error.message if isinstance(error, NergError) else str(error)).strip()
     if is_lack_of_memory(error):
         # The loader and the operating system name a library or a function, which is not the cause.
         text = text if isinstance(error, MemoryError) else ""
@@ -247,7 +252,7 @@ def sanitize(text: object, max_length: int = 300) -> str:
 
     Control characters are replaced by "?", and text beyond ``max_length`` characters is truncated.
     """
-    text_out = "".join(c if c.isprintable() else "?" for c in str(text)[: max_length + 1])
+    text_out = "".join(c if c.isprintable() or c in _MARKS else "?" for c in str(text)[: max_length + 1])
     return text_out if len(text_out) <= max_length else text_out[:max_length] + "..."
 
 
@@ -255,12 +260,13 @@ _INVISIBLE = ("Cc", "Cf", "Cs")  # control characters, format characters such as
 _ALLOWED = "\n\t\u200c\u200d"  # line breaks, tabs, and the joiners of Persian, Indic scripts and emoji
 
 
-def clean_text(text: str) -> str:
+def clean_text(text: str, spelling: Spelling = spell_python) -> str:
     """Return ``text`` without characters that control a terminal or reorder what it shows; "?" replaces them.
 
     Every message, warning, line of progress and figure passes through this function, since names of participants, files
-    and areas may contain anything.
+    and areas may contain anything. ``spelling`` spells the parameters that the text mentions.
     """
+    text = spell_parameters(text, spelling)
     if text.isascii() and text.isprintable():
         return text
     return "".join("?" if unicodedata.category(c) in _INVISIBLE and c not in _ALLOWED else c for c in text)

@@ -7,8 +7,17 @@ import threading
 from pathlib import Path
 from typing import Any
 
+from nerg_mi.errors import clean_text, parameter
 
-class TrainingInterrupted(KeyboardInterrupt):
+
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C ended a computation; the message says how to continue, and may mention parameters."""
+
+    def __str__(self) -> str:
+        return clean_text(super().__str__())
+
+
+class TrainingInterrupted(Interrupted):
     """Ctrl-C ended a training before its last step.
 
     Attributes
@@ -25,7 +34,7 @@ class TrainingInterrupted(KeyboardInterrupt):
     """
 
     def __init__(self, field: Any, provenance: dict[str, Any], state: Path | None = None):
-        message = f"interrupted; continue with --resume (state in {state})"
+        message = f"interrupted; continue with {parameter('resume', True)} (state in {state})"
         if state is None:
             steps = provenance["steps"]
             message = f'interrupted after {steps} steps; the attribute "field" of this exception has the result so far'

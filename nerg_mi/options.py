@@ -198,7 +198,7 @@ def parse_definitions(pairs: Iterable[str], flag: str) -> dict[str, str]:
     for pair in pairs:
         key, equals, value = pair.partition("=")
         if not (key and equals):
-            raise NergError(f'"-D {pair}" is not a definition: write -D KEY=VALUE')
+            raise NergError(f"{flag} {pair} is not a definition: write KEY=VALUE")
         values[key] = value
     return values
 

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, runtime_checkable
 
-from .errors import NergError, clean_text, parameter
+from .errors import NergError, Spelling, clean_text, parameter, spell_python
 from .files.html import element, markup
 
 if TYPE_CHECKING:
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 @runtime_checkable
 class Reporter(Protocol):
     """Receives messages and progress of a workflow.
+
+    Texts may mention parameters, which `nerg_mi.errors.clean_text` spells.
 
     Methods return immediately and do not raise, except that `progress` may raise `KeyboardInterrupt` to stop the
     workflow like Ctrl-C.
@@ -72,8 +74,11 @@ class TerminalReporter:
     if that is a terminal; pipes and files never contain it. Otherwise the standard error gets a line every ten seconds,
     also during a long step. The remaining time is added, extrapolated from the progress so far, or the elapsed time if
     that is not possible: before any progress, and in a step that has reported none for ten seconds, since an estimate
-    would grow with the time that it takes.
+    would grow with the time that it takes. ``spelling`` spells the parameters that a text mentions.
     """
+
+    def __init__(self, spelling: Spelling = spell_python) -> None:
+        self._spelling = spelling
 
     def __enter__(self) -> TerminalReporter:
         self._bar: Any = None
@@ -118,7 +123,7 @@ class TerminalReporter:
 
     def line(self) -> str:
         """Return the current step with the remaining or elapsed time."""
-        share, text = self._now[0], clean_text(self._now[1])
+        share, text = self._now[0], clean_text(self._now[1], self._spelling)
         elapsed = 0.0 if self._begun is None else time.monotonic() - self._begun
         if text.endswith(" left") or " left, " in text:
             return text
@@ -161,7 +166,7 @@ class TerminalReporter:
         return bar
 
     def _print(self, text: str, stream) -> None:
-        text = clean_text(text)
+        text = clean_text(text, self._spelling)
         if self._bar is not None and stream.isatty():
             # Above the bar, on the same terminal.
             self._bar.console.print(text, markup=False, highlight=False, soft_wrap=True)
@@ -195,7 +200,7 @@ class NotebookReporter(TerminalReporter):
             super().progress(fraction, text)
 
     def message(self, text: str) -> None:
-        self._messages.append(text)
+        self._messages.append(clean_text(text, self._spelling))
 
     def _start(self) -> Any:
         module: Any = import_module("IPython.display")  # exists where there is a notebook
@@ -212,7 +217,7 @@ class NotebookReporter(TerminalReporter):
         self._bar.update(self._make_html(markup([bar, f" {fraction:.0%} {self.line()}"])))
 
     def _print(self, text: str, stream) -> None:
-        print(clean_text(text), file=stream, flush=True)
+        print(clean_text(text, self._spelling), file=stream, flush=True)
 
     def __exit__(self, *error) -> None:
         self._ended.set()
@@ -256,6 +261,23 @@ def duration(seconds: float) -> str:
 
 # ---- Progress of a call ----
 
+
+class SpellingReporter:
+    """Passes on to a ``reporter`` of the caller what is reported, with parameters spelled as in Python."""
+
+    def __init__(self, reporter: Reporter) -> None:
+        self._reporter = reporter
+
+    def message(self, text: str) -> None:
+        self._reporter.message(clean_text(text))
+
+    def warn(self, text: str) -> None:
+        self._reporter.warn(clean_text(text))
+
+    def progress(self, fraction: float, text: str = "") -> None:
+        self._reporter.progress(fraction, clean_text(text))
+
+
 Progress: TypeAlias = "bool | Reporter | None"
 """Argument of functions. None shows a progress bar in notebooks, True shows one anywhere, and False none. Warnings
 become those of Python where there is no bar. A `Reporter` receives everything."""
@@ -265,7 +287,8 @@ become those of Python where there is no bar. A `Reporter` receives everything."
 def open_reporter(progress: Progress) -> Iterator[Reporter]:
     """Yield the reporter of a call. Raises `NergError` for anything but a `Progress`."""
     if isinstance(progress, Reporter):
-        yield progress
+        # Reporters of this package spell what they show, that of a command as options.
+        yield progress if isinstance(progress, (SilentReporter, TerminalReporter)) else SpellingReporter(progress)
         return
     if not (progress is None or isinstance(progress, bool)):
         raise NergError(f"{parameter('progress')} must be True, False or a Reporter, got {type(progress).__name__}")

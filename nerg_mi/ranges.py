@@ -221,8 +221,7 @@ class ValidatedDataclass:
 
 def _describe_field(field: dataclasses.Field) -> str:
     """Return the name of ``field`` in error messages."""
-    flag = field.metadata.get(FLAG)
-    return field.name if flag is None else flag or "--" + field.name.replace("_", "-")
+    return parameter(field.name) if FLAG in field.metadata else field.name
 
 
 def _format_value(value: Any) -> str:

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_edt, label
 
-from nerg_mi.errors import MissingFile, NergError
+from nerg_mi.errors import MissingFile, NergError, parameter
 from nerg_mi.files.safe_read import read_npy
 from nerg_mi.formats.meshes import READERS, read_mesh_file
 from nerg_mi.maths.coordinates import check_coordinates, check_near_origin
@@ -409,9 +409,8 @@ class AlignmentTarget:
         if self.points is not None:
             return surface_from_points(transform_points(self.to_z_up, self.points))
         raise NergError(
-            "this evidence needs the geometry of the scene: give --field FILE, --scene FILE or --surface FILE (a "
-            "mesh or "
-            "points)"
+            f"this evidence needs the geometry of the scene: give {parameter('field', 'FILE')}, "
+            f"{parameter('scene', 'FILE')} or {parameter('surface', 'FILE')} (a mesh or points)"
         )
 
     @cached_property
@@ -461,10 +460,10 @@ class Interval:
             names.append("shift")
         if not names:
             return ""
-        remedies = ", ".join(f"--{name}" for name in names)
+        remedies = ", ".join(parameter(name) for name in names)
         return (
-            f"the samples do not determine the {' and the '.join(names)}: {self.describe()}; give {remedies} if you "
-            "know the value, picked points (--pairs), or samples with hit points"
+            f"the samples do not determine the {' and the '.join(names)}: {self.describe()}; give {remedies} if "
+            f"you know the value, picked points ({parameter('pairs')}), or samples with hit points"
         )
 
 

@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 
 from .constraints import (
     AlignmentFit,
@@ -459,8 +459,8 @@ def _warn_rivals(placements: list[_Placement], size: float) -> list[str]:
         if _is_distinct(best, other, size) and mean_distance(other) < _RIVAL_RATIO * mean_distance(best):
             return [
                 f"another placement fits almost as well ({100 * mean_distance(other):.2g} cm, the best "
-                f"{100 * mean_distance(best):.2g} "
-                "cm): the scene may be symmetric; use three picked points (--pairs) to decide"
+                f"{100 * mean_distance(best):.2g} cm): the scene may be symmetric; use three picked points "
+                f"({parameter('pairs')}) to decide"
             ]
     return []
 

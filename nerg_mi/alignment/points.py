@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from nerg_mi.errors import NergError, sanitize
+from nerg_mi.errors import NergError, parameter, sanitize
 from nerg_mi.files.safe_read import check_regular_file, read_json, translate_read_errors
 from nerg_mi.files.schema import NUMBER, Items, check_json
 from nerg_mi.photos.colmap import find_pose_source
@@ -66,7 +66,8 @@ class Cameras:
         a, b = self.tracking, self.environment
         if target.turn is not None or target.shift is not None:
             raise NergError(
-                "--turn and --shift do not apply to --tracking-cameras, which determine both; leave them out"
+                f"{parameter('turn')} and {parameter('shift')} do not apply to {parameter('tracking_cameras')}, "
+                "which determine both; leave them out"
             )
         if len(a) < 2:
             raise NergError(f"{self.source} have {len(a)} photos in common, but at least two are needed; add photos")

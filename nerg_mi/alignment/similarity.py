@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.maths.coordinates import check_coordinates
 
 # ---- Closed-form fit ----
@@ -71,8 +71,8 @@ def fit_similarity(
         scale = float(np.sum(covariance * rotation)) / spread if spread > 0 else 1.0
         if not scale > 0 and (turn is not None or shift is not None):
             raise NergError(
-                "no positive scale agrees with the points and the given turn or shift: correct --turn or --shift, or "
-                "leave them out"
+                "no positive scale agrees with the points and the given turn or shift: correct "
+                f"{parameter('turn')} or {parameter('shift')}, or leave them out"
             )
     matrix = np.eye(4)
     matrix[:3, :3] = scale * rotation

@@ -10,7 +10,7 @@ import numpy as np
 from scipy import fft
 from scipy.stats import wilcoxon
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.rays.direction_checks import AXIS_SWAPS, DECLARED, compute_head_frames
 from nerg_mi.rays.rays import Rays
 
@@ -53,8 +53,8 @@ class AxisFlips:
             return None
         return (
             f"the gaze passes {declared_median:.2g} degrees from the nearest point of the scene (median), but "
-            f"{best_median:.2g} with "
-            f"{best}: check the axes of the directions at the import (--hand, --forward, or a sign in --map)"
+            f"{best_median:.2g} with {best}: check the axes of the directions at the import "
+            f"({parameter('handedness')}, {parameter('forward')}, or a sign in {parameter('columns')})"
         )
 
 
@@ -302,19 +302,19 @@ class Tracking:
             return self._make_fit(best, sample, target, [], None, profile)
         if not target.is_upright:
             raise NergError(
-                "an alignment from the tracking alone needs the up direction of the scene: give --up, or other "
-                "evidence "
-                "(--pairs, --tracking-surface, --tracking-cameras)"
+                "an alignment from the tracking alone needs the up direction of the scene: give "
+                f"{parameter('up')}, or other evidence ({parameter('pairs')}, {parameter('tracking_surface')}, "
+                f"{parameter('tracking_cameras')})"
             )
         if target.tracking_floor is None:
             raise NergError(
-                "an alignment from the tracking alone needs the height of the floor in the tracking; give it "
-                "with --floor-height"
+                "an alignment from the tracking alone needs the height of the floor in the tracking; give it with "
+                f"{parameter('floor_height')}"
             )
         if target.scale is None and target.turn is None and not len(sample.hits):
             raise NergError(
-                "samples without hit points do not determine turn and scale: give --scale (1 if the scene is in "
-                "metres), --turn, or other evidence (--pairs)"
+                f"samples without hit points do not determine turn and scale: give {parameter('scale')} (1 if the "
+                f"scene is in metres), {parameter('turn')}, or other evidence ({parameter('pairs')})"
             )
         progress(0.1, "searching the placement of the tracking")
         placements, starts = _search_and_refine(sample, target)
@@ -331,8 +331,8 @@ class Tracking:
             if not is_same and other.cost < _RIVAL_RATIO * placements[0].cost:
                 warnings.append(
                     f"another placement agrees almost as well (cost {other.cost:.3f}, the best "
-                    f"{placements[0].cost:.3f}): "
-                    "the scene may be symmetric; use picked points (--pairs) to decide"
+                    f"{placements[0].cost:.3f}): the scene may be symmetric; use picked points "
+                    f"({parameter('pairs')}) to decide"
                 )
                 break
         mirror_warning = None

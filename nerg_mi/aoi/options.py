@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from nerg_mi.errors import NergError, sanitize
+from nerg_mi.errors import NergError, parameter, sanitize
 from nerg_mi.old_names import accept_old_keywords
 from nerg_mi.options import (
     ALIGN_HELP,
@@ -211,7 +211,7 @@ class StatisticsOptions(CountOptions, PredictionOptions, PartOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         for text in self.observers:
-            parse_point(text, "--observer")
+            parse_point(text, parameter("observers"))
 
 
 # The command is declared in nerg_mi.workflows.scene_commands.
@@ -221,7 +221,9 @@ accept_old_keywords(StatisticsOptions, "stats")
 def parse_window(text: str) -> tuple[str, float, float]:
     """Parse NAME=FROM,TO into a name, a start and an end. Raises `NergError` for any other text."""
     name, sign, rest = text.partition("=")
-    ends = parse_numbers(rest, "--window") if sign else ()
+    ends = parse_numbers(rest, parameter("windows")) if sign else ()
     if not name.strip() or len(ends) != 2 or not TIMES.low <= ends[0] < ends[1] <= TIMES.high:
-        raise NergError(f'--window must be NAME=FROM,TO in seconds, as in morning=0,3600, got "{sanitize(text, 60)}"')
+        raise NergError(
+            f'{parameter("windows")} must be NAME=FROM,TO in seconds, as in morning=0,3600, got "{sanitize(text, 60)}"'
+        )
     return name.strip(), ends[0], ends[1]

@@ -13,7 +13,7 @@ from zlib import crc32
 import numpy as np
 
 from nerg_mi.alignment.check import read_similarity
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.fields.gaze_base import TRACKING_NOTES
 from nerg_mi.files.tables import join_reasons
 from nerg_mi.formats.areas import AreaGroup, AreaSet, read_regions
@@ -102,7 +102,8 @@ def subsample_participants(viewpoints: Viewpoints, max_participants: int, report
     if len(names) <= max_participants:
         return viewpoints
     reporter.message(
-        f"the prediction uses {max_participants:,} of {len(names):,} participants; --viewpoints {len(names)} uses all"
+        f"the prediction uses {max_participants:,} of {len(names):,} participants; "
+        f"{parameter('viewpoints', len(names))} uses all"
     )
     chosen_names = set(names[:max_participants])
     rows = [k for k, person in enumerate(viewpoints.participants) if person in chosen_names]
@@ -223,9 +224,8 @@ def place_observers_on_floor(gaze_scene: GazeScene, height: float, step: float, 
     )
     if not len(positions):
         raise NergError(
-            f"no walkable floor was found at height {floor:g} (--floor-height) below eyes at {height:g} "
-            "(--eye-height); "
-            "correct one of them"
+            f"no walkable floor was found at height {floor:g} ({parameter('floor_height')}) below eyes at "
+            f"{height:g} ({parameter('eye_height')}); correct one of them"
         )
     return positions
 
@@ -371,7 +371,7 @@ def load_aoi_scene(
     doubts: list[str] = []
     align = None
     if options.align is not None:
-        align = read_similarity(options.align, "--align", "rays to scene", doubts.append)
+        align = read_similarity(options.align, parameter("align"), "rays to scene", doubts.append)
     gaze_scene = load_gaze_scene(scene, field, gaze, align, ns)
     meshes = read_meshes(areas.meshes)
     aois = make_aois(areas.elements, shapes_by_id(gaze_scene.scene), meshes, gaze_scene.scene)
@@ -462,9 +462,8 @@ def warn_few_viewpoints(viewpoints: Viewpoints, reporter: Reporter) -> None:
     if num_participants and len(viewpoints.participants) < MIN_VIEWPOINTS * num_participants:
         reporter.message(
             f"the prediction uses {len(viewpoints.participants) / num_participants:.1f} viewpoints per "
-            "participant, which biases "
-            f"the hit ratio low; use --viewpoints {MIN_VIEWPOINTS * num_participants} for {MIN_VIEWPOINTS} per "
-            "participant"
+            "participant, which biases the hit ratio low; use "
+            f"{parameter('viewpoints', MIN_VIEWPOINTS * num_participants)} for {MIN_VIEWPOINTS} per participant"
         )
 
 

@@ -89,7 +89,7 @@ def statistics(
 
     if areas is not None:
         options["aois"] = areas
-    with report_progress(progress, StatisticsOptions) as reporter:
+    with report_progress(progress) as reporter:
         resolved = build_options(StatisticsOptions, "statistics", None, options)
         files = [item if isinstance(item, Rays) else as_scene_file(item, "inputs") for item in list_inputs(inputs)]
         return compute(files, None if output is None else Path(output), resolved, reporter)
@@ -150,7 +150,7 @@ def bake(
     files = [outputs] if isinstance(outputs, (str, Path)) or not isinstance(outputs, Sequence) else list(outputs)
     for file in files:
         check_output(file, "outputs")
-    with report_progress(progress, BakeOptions) as reporter:
+    with report_progress(progress) as reporter:
         resolved = build_options(BakeOptions, "bake", options, overrides)
         surface_file, paths = as_file(surface, "surface"), [Path(str(file)) for file in files]
         return baking.bake_any(surface_file, paths, resolved, reporter, in_memory)
@@ -203,7 +203,7 @@ def report(
     from nerg_mi.workflows.report import make_report
 
     check_output(output)
-    with report_progress(progress, ReportOptions) as reporter:
+    with report_progress(progress) as reporter:
         resolved = build_options(ReportOptions, "report", options, overrides)
         path = session_folder() / f"report-{uuid4().hex[:12]}.html" if output is None else Path(output)
         files = [as_file(item, "inputs") for item in list_inputs(inputs)]
@@ -250,10 +250,9 @@ def draw(
     True
     """
     from nerg_mi.workflows.draw import draw as draw_figure
-    from nerg_mi.workflows.draw import find_kind
 
     check_output(output)
-    with report_progress(progress, find_kind(kind).options) as reporter:
+    with report_progress(progress) as reporter:
         several = list(inputs) if isinstance(inputs, (list, tuple)) else [inputs]
         files = [as_file(item, "inputs") for item in several]
         if (scene := options.get("scene")) is not None:
@@ -309,7 +308,7 @@ def write_scene(
 
     check_output(output)
     output = Path(output)
-    with report_progress(progress, SceneOptions) as reporter:
+    with report_progress(progress) as reporter:
         resolved = build_options(SceneOptions, "write_scene", options, overrides)
         files = [as_file(item, "inputs") for item in list_inputs(inputs)]
         for file in files:
@@ -364,7 +363,7 @@ def render_film(
     from nerg_mi.workflows.render import render_film as render_to_file
 
     check_output(output)
-    with report_progress(progress, FilmOptions) as reporter:
+    with report_progress(progress) as reporter:
         resolved = build_options(FilmOptions, "render_film", options, overrides)
         return render_to_file(as_file(scene, "scene"), Path(output), resolved, reporter).path
 
@@ -431,7 +430,7 @@ def export(
         reason = "since its name does not tell it" if kind is None else f'got "{kind}"'
         raise NergError(f'kind must be one of {", ".join(_EXPORTS)} for "{output}", {reason}')
     function, option_type = _EXPORTS[chosen]
-    with report_progress(progress, option_type) as reporter:
+    with report_progress(progress) as reporter:
         resolved = build_options(option_type, f"export of {chosen}", None, options)
         if isinstance(field, TrainedField) and field.kind != "radiance":
             raise NergError(
@@ -495,7 +494,7 @@ def export_scene(
     from nerg_mi.workflows.export_scene import export_scene as write
 
     check_output(output)
-    with report_progress(progress, SceneExportOptions) as reporter:
+    with report_progress(progress) as reporter:
         resolved = build_options(SceneExportOptions, "export_scene", options, overrides)
         files = [
             as_file(item, name)
@@ -547,7 +546,7 @@ def import_checkpoint(
     from nerg_mi.workflows.export import import_checkpoint as read
 
     path = resolve_file(file, "file")
-    with report_progress(progress, CheckpointImportOptions) as reporter:
+    with report_progress(progress) as reporter:
         resolved = build_options(CheckpointImportOptions, "import_checkpoint", options, overrides)
         fields = read(path, None, None, resolved, reporter)
     return (
@@ -603,6 +602,6 @@ def find_poses(
     from nerg_mi.workflows.poses import find_poses as estimate
 
     check_output(output)
-    with report_progress(progress, PoseOptions) as reporter:
+    with report_progress(progress) as reporter:
         resolved = build_options(PoseOptions, "find_poses", options, overrides)
         return estimate(resolve_file(pictures, "pictures"), Path(output), resolved, reporter)

@@ -71,7 +71,7 @@ def evaluate_radiance(
     """
     from nerg_mi.workflows import train_radiance
 
-    with report_progress(progress, RadianceScoreOptions) as reporter:
+    with report_progress(progress) as reporter:
         resolved = build_options(RadianceScoreOptions, "evaluate_radiance", options, overrides)
         return train_radiance.evaluate_radiance(
             as_file(field, "field"), resolve_file(photos, "photos"), resolved, reporter
@@ -127,7 +127,7 @@ def evaluate_gaze(
     from nerg_mi.workflows import evaluate
 
     check_output(output)
-    with report_progress(progress, GazeEvaluationOptions) as reporter:
+    with report_progress(progress) as reporter:
         if options is None:
             overrides = training_geometry(gaze) | overrides
         resolved = build_options(GazeEvaluationOptions, "evaluate_gaze", options, overrides)
@@ -191,7 +191,7 @@ def next_look(
     from nerg_mi.workflows import next_look
 
     check_output(output)
-    with report_progress(progress, NextLookOptions) as reporter:
+    with report_progress(progress) as reporter:
         if options is None:
             overrides = training_geometry(gaze) | overrides
         resolved = build_options(NextLookOptions, "next_look", options, overrides)
@@ -245,7 +245,7 @@ def study(
     from nerg_mi.workflows import study as studies
 
     check_output(output)
-    with report_progress(progress, StudyOptions) as reporter:
+    with report_progress(progress) as reporter:
         resolved = build_options(StudyOptions, "study", options, overrides)
         file = scene if isinstance(scene, str) else str(as_file(scene, "scene"))
         folder = session_folder() / f"study-{uuid4().hex[:12]}" if output is None else output
@@ -298,7 +298,7 @@ def folds(
     from nerg_mi.workflows import evaluate
 
     check_output(output)
-    with report_progress(progress, FoldOptions) as reporter:
+    with report_progress(progress) as reporter:
         resolved = build_options(FoldOptions, "folds", options, overrides)
         folder = session_folder() / f"folds-{uuid4().hex[:12]}" if output is None else output
         return evaluate.evaluate_folds(resolve_rays(rays), folder, resolved, reporter)

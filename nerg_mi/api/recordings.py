@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, clean_text
 from nerg_mi.files.values import FilePath
 from nerg_mi.rays.rays import Rays
 from nerg_mi.workflows.rays_commands import AlignOptions, FilterOptions, PlotOptions, RaysImportOptions, SplitOptions
@@ -75,9 +75,7 @@ def import_rays(
     from nerg_mi.workflows import rays
     from nerg_mi.workflows.rays import current_import_keywords
 
-    # An unknown reader is reported below.
-    settings = [get_reader(reader).Options] if reader in list_reader_names() else []
-    with report_progress(progress, *settings, RaysImportOptions) as reporter:
+    with report_progress(progress) as reporter:
         options = current_import_keywords(options)
         file_list = [files] if isinstance(files, (str, os.PathLike)) or not isinstance(files, Sequence) else files
         if not all(isinstance(file, (str, os.PathLike)) for file in file_list):
@@ -160,7 +158,7 @@ def align(
     from nerg_mi.workflows import align as alignment
 
     check_output(output)
-    with report_progress(progress, AlignOptions) as reporter:
+    with report_progress(progress) as reporter:
         resolved = build_options(AlignOptions, "align", options, overrides)
         return alignment.align(None if rays is None else resolve_rays(rays), output, resolved, reporter).alignment
 
@@ -200,7 +198,11 @@ def guess(files: FilePath | Sequence[FilePath], *, progress: Progress = None) ->
 
     several = [files] if isinstance(files, (str, os.PathLike)) else list(files)
     with report_progress(progress) as reporter:
-        return guess_imports([resolve_file(file, "files") for file in several], reporter)
+        proposals = guess_imports([resolve_file(file, "files") for file in several], reporter)
+    for proposal in proposals:
+        for sentences in (proposal.assumptions, proposal.questions):
+            sentences[:] = map(clean_text, sentences)
+    return proposals
 
 
 def check_rays(rays: Rays | FilePath, *, progress: Progress = None) -> QualityReport:
@@ -281,7 +283,7 @@ def filter_rays(
     from nerg_mi.rays.dataset import load_rays
     from nerg_mi.workflows.rays import filter_rays as select
 
-    with report_progress(progress, FilterOptions) as reporter:
+    with report_progress(progress) as reporter:
         resolved = build_options(FilterOptions, "filter_rays", options, overrides)
         result = select(resolve_rays(rays), resolved, reporter)
         if result.rays is not None:
@@ -326,7 +328,7 @@ def split_rays(
     """
     from nerg_mi.workflows.rays import split_rays as split
 
-    with report_progress(progress, SplitOptions) as reporter:
+    with report_progress(progress) as reporter:
         resolved = build_options(SplitOptions, "split_rays", options, overrides)
         result = split(resolve_rays(rays), resolved, reporter)
     return result.train, result.test
@@ -378,7 +380,7 @@ def plot_rays(
     from nerg_mi.workflows.rays import plot_rays as plot
 
     check_output(output)
-    with report_progress(progress, PlotOptions) as reporter:
+    with report_progress(progress) as reporter:
         changes = overrides if output is None else {**overrides, "output": output}
         resolved = build_options(PlotOptions, "plot_rays", options, changes)
         figure = figure_of(plot(resolve_rays(rays), resolved, reporter, axes))

@@ -73,7 +73,7 @@ def train_radiance(
     from nerg_mi.workflows import train_radiance as radiance
 
     check_output(output)
-    with report_progress(progress, RadianceOptions) as reporter:
+    with report_progress(progress) as reporter:
         resolved = build_options(RadianceOptions, "train_radiance", options, overrides)
         make = lambda result: TrainedField(result.field, result.provenance, *_locate(output))
         with _converting_interrupts(make):
@@ -128,7 +128,7 @@ def train_gaze(
     from nerg_mi.workflows import train_gaze as gaze
 
     check_output(output)
-    with report_progress(progress, GazeOptions) as reporter:
+    with report_progress(progress) as reporter:
         resolved = build_options(GazeOptions, "train_gaze", options, overrides)
         volume = None
         if output is None and resolved.geometry == "hits":
@@ -191,7 +191,7 @@ def train_prior(
 
     check_output(output)
     environments = [rays] if isinstance(rays, (str, os.PathLike, Rays)) else rays
-    with report_progress(progress, PriorOptions) as reporter:
+    with report_progress(progress) as reporter:
         resolved = build_options(PriorOptions, "train_prior", options, overrides)
         inputs = [item if isinstance(item, Rays) else resolve_file(item, "rays") for item in environments]
         result = gaze.learn_prior(inputs, output, resolved, reporter)

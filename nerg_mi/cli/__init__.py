@@ -15,7 +15,7 @@ with quiet_ctrl_c():
     from nerg_mi.errors import clean_text
     from nerg_mi.memory import NUMPY_MEGABYTES, SCIPY_MEGABYTES, require_address_space
 
-    from .building import DEBUG, build_app
+    from .building import DEBUG, build_app, choose_spelling
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -42,12 +42,16 @@ def main(arguments: list[str] | None = None) -> None:
         except BaseException as error:
             interrupt = ctrl_c.find_interrupt(error)
             if interrupt is not None:
-                print(clean_text(str(interrupt)) or "Interrupted.", file=sys.stderr)
+                print(
+                    clean_text("".join(map(str, interrupt.args)), choose_spelling(arguments)) or "Interrupted.",
+                    file=sys.stderr,
+                )
                 sys.exit(INTERRUPTED)
             if not isinstance(error, Exception):  # normal end of a command
                 raise
             if debug:
                 traceback.print_exception(error)
             code, text = exit_code(error)
-            print(f"nerg: {clean_text(shorten_values(text, arguments))}", file=sys.stderr)
+            text = clean_text(shorten_values(text, arguments), choose_spelling(arguments))
+            print(f"nerg: {text}", file=sys.stderr)
             sys.exit(code)

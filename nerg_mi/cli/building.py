@@ -19,7 +19,7 @@ import typer
 import typer.core
 
 from nerg_mi import __version__
-from nerg_mi.errors import clean_text, sanitize
+from nerg_mi.errors import Spelling, clean_text, parameter, sanitize, spell_command_line
 from nerg_mi.old_names import find_spelling
 from nerg_mi.options import GROUPS as GROUPS_OF_OPTIONS
 from nerg_mi.progress import TerminalReporter
@@ -210,11 +210,11 @@ class _GroupedCommand(typer.core.TyperCommand):
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         view, sections = self._choose_view(ctx), dict[str, list[tuple[str, str]]]()
-        for parameter in self.get_params(ctx):
-            record = parameter.get_help_record(ctx)
-            if record is not None and parameter.name not in view.hidden:
-                record = record[0], view.helps.get(parameter.name or "", record[1])
-                sections.setdefault(_heading(parameter), []).append(record)
+        for shown in self.get_params(ctx):
+            record = shown.get_help_record(ctx)
+            if record is not None and shown.name not in view.hidden:
+                record = record[0], view.helps.get(shown.name or "", record[1])
+                sections.setdefault(_heading(shown), []).append(record)
         sections |= {heading: list(records) for heading, records in view.lists.items()}
         for heading, records in sections.items():
             with formatter.section(heading):
@@ -224,17 +224,17 @@ class _GroupedCommand(typer.core.TyperCommand):
 _ARGUMENTS = "nerg_mi.arguments"  # of the command, in click's context
 
 
-def _heading(parameter: Any) -> str:
-    if parameter.param_type_name == "argument":
+def _heading(shown: Any) -> str:
+    if shown.param_type_name == "argument":
         return "Arguments"
-    return f"{parameter.rich_help_panel} options" if parameter.rich_help_panel else "Other options"
+    return f"{shown.rich_help_panel} options" if shown.rich_help_panel else "Other options"
 
 
-def _group_position(parameter: Any) -> int:
+def _group_position(shown: Any) -> int:
     """Sort key: arguments first, then options by their groups."""
-    if parameter.param_type_name == "argument":
+    if shown.param_type_name == "argument":
         return -1
-    return GROUPS_OF_OPTIONS.index(parameter.rich_help_panel) if parameter.rich_help_panel else len(GROUPS_OF_OPTIONS)
+    return GROUPS_OF_OPTIONS.index(shown.rich_help_panel) if shown.rich_help_panel else len(GROUPS_OF_OPTIONS)
 
 
 def build_command(command: Command, line: str = "") -> Any:
@@ -264,18 +264,58 @@ def make_callback(command: Command) -> Callable[..., None]:
     shown = {name: f for name, f in every.items() if name not in more and name not in command.without}
     parameters = {name: _parameter(name, p) for name, p in more.items()}
     parameters |= {name: _option(f, get_type_hints(kind)[name]) for name, f in shown.items()}
+    spelling = _make_spelling(parameters)
 
     def call(**values: Any) -> None:
         if kind is not None:
             settings = {name: _value(f, parameters[name], values.pop(name)) for name, f in shown.items()}
             settings |= {name: values.pop(name) for name in more if name in every}
             values["options"] = kind(**settings)
-        with TerminalReporter() as reporter:
+        with TerminalReporter(spelling) as reporter:
             command.run(**values, reporter=reporter)
 
     call.__signature__ = inspect.Signature(list(parameters.values()))
     call.__annotations__ = {name: p.annotation for name, p in parameters.items()}
+    call.__dict__["spelling"] = spelling
     return call
+
+
+# Spellings of parameters in messages that advise another command, where the option is not named as the parameter.
+_FLAGS = {
+    "columns": "--map",
+    "defaults": "--define",
+    "handedness": "--hand",
+    "observers": "--observer",
+    "persons": "--person",
+}
+
+
+def _make_spelling(parameters: Mapping[str, inspect.Parameter]) -> Spelling:
+    """Return the spelling of ``parameters`` in messages: options by their flags, and arguments in capital letters."""
+    flags = dict(_FLAGS)
+    for name, declared in parameters.items():
+        (info,) = declared.annotation.__metadata__
+        if isinstance(info, typer.models.OptionInfo):
+            # In annotations, typer stores the first spelling as the default.
+            names = [f"--{name.replace('_', '-')}", info.default, *(info.param_decls or ())]
+            flags[name] = [spelling for spelling in names if isinstance(spelling, str)][-1].partition("/")[0]
+        else:
+            flags[name] = info.metavar or name.upper()
+
+    def spell(name: str, value: str) -> str:
+        flag = flags.get(name, "")
+        return spell_command_line(name, value, flag) if flag.startswith("-") or not flag else flag
+
+    return spell
+
+
+def choose_spelling(arguments: Sequence[str]) -> Spelling:
+    """Return the spelling of parameters in messages of the command that ``arguments`` call."""
+    for name, command in COMMANDS.items():
+        words = name.split()
+        if words == list(arguments[: len(words)]):
+            return make_callback(command).__dict__["spelling"]
+    return _make_spelling({})
 
 
 def _parameter(name: str, declared: Parameter) -> inspect.Parameter:
@@ -316,10 +356,10 @@ def _is_repeatable(hint: Any) -> bool:
     return any(get_origin(kind) is list for kind in get_args(hint))
 
 
-def _value(field: Field, parameter: inspect.Parameter, value: Any) -> Any:
+def _value(field: Field, declared: inspect.Parameter, value: Any) -> Any:
     """Convert the ``value`` of ``field`` from the command line."""
-    parse, names = field.metadata["parse"], field.metadata["names"]
-    value = tuple(value or ()) if _is_repeatable(get_args(parameter.annotation)[0]) else value
+    parse = field.metadata["parse"]
+    value = tuple(value or ()) if _is_repeatable(get_args(declared.annotation)[0]) else value
     if parse is None or value is None:
         return value
-    return parse(value, names[-1] if names else "--" + field.name.replace("_", "-"))
+    return parse(value, parameter(field.name))

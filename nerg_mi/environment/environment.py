@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import MissingFile, NergError, translate_mitsuba_errors
+from nerg_mi.errors import MissingFile, NergError, parameter, translate_mitsuba_errors
 from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.files.atomic import file_sha256
 from nerg_mi.formats.fields import load_radiance
@@ -116,7 +116,7 @@ def _load_mesh_scene(path: Path) -> tuple[Any, tuple[str, ...]]:
     import mitsuba as mi
 
     if path.suffix.lower() in READERS and is_splat_file(path):
-        raise NergError(f'"{path}" contains Gaussian splats, not a mesh; pass it with --field')
+        raise NergError(f'"{path}" contains Gaussian splats, not a mesh; pass it with {parameter("field")}')
     mesh = read_mesh_file(path)
     with translate_mitsuba_errors(path):
         return mi.load_dict({"type": "scene", "mesh": make_mesh(mesh.vertices, mesh.faces, "mesh")}), mesh.notes

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.maths.geometry import Box, intersect_box_numpy
 from nerg_mi.ranges import LENGTHS, check_number
 from nerg_mi.rays.rays import Rays
@@ -90,9 +90,9 @@ def compute_hit_extent(rays: Rays, voxel: float | None = None, max_voxels: int =
         If the rays have no hit points, or ``voxel`` is too small or not positive.
     """
     if rays.hit is None or not (has_hit := np.isfinite(rays.hit).all(axis=1)).any():
-        raise NergError("these rays have no hit points; pass a radiance field with --field instead")
+        raise NergError(f"these rays have no hit points; pass a radiance field with {parameter('field')} instead")
     if voxel is not None:
-        check_number(voxel, LENGTHS, "--voxel-size")
+        check_number(voxel, LENGTHS, parameter("voxel_size"))
     hits = rays.hit[has_hit]
     first, last = np.quantile(hits, [_OUTLIER_QUANTILE, 1 - _OUTLIER_QUANTILE], axis=0)
     low, high = np.minimum(first, rays.origin.min(axis=0)), np.maximum(last, rays.origin.max(axis=0))
@@ -114,7 +114,7 @@ def compute_hit_extent(rays: Rays, voxel: float | None = None, max_voxels: int =
             size = " x ".join(f"{s:.3g}" for s in core[1] - core[0])
             raise NergError(
                 f"the participants moved in {size} m, which needs more than {max_voxels:,} voxels of {voxel:g} m; "
-                "use a larger --voxel-size or leave it out"
+                f"use a larger {parameter('voxel_size')} or leave it out"
             )
         edge *= 2 ** (1 / 3)  # Half as many voxels
 
@@ -208,7 +208,7 @@ def voxelise_hits(rays: Rays, voxel: float | None = None, extent: HitExtent | No
 
     extent = extent or compute_hit_extent(rays, voxel)
     if rays.hit is None:
-        raise NergError("these rays have no hit points; pass a radiance field with --field instead")
+        raise NergError(f"these rays have no hit points; pass a radiance field with {parameter('field')} instead")
     has_hit = np.isfinite(rays.hit).all(axis=1)
     hits, origins = rays.hit[has_hit], rays.origin[has_hit]
     if extent.is_cut:

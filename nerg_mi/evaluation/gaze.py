@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.fields.gaze_base import AnyGazeField
 from nerg_mi.fields.kde import SphericalKde
 from nerg_mi.maths.arrays import to_vector
@@ -99,7 +99,8 @@ class FieldDensity:
     ):
         if medium is None and field.config.needs_surfaces:
             raise NergError(
-                "this gaze field was trained with surfaces; pass its geometry with --field, --scene or --geometry"
+                f"this gaze field was trained with surfaces; pass its geometry with {parameter('field')}, "
+                f"{parameter('scene')} or {parameter('geometry')}"
             )
         self._gaze, self._environment = (
             GazeFieldInstance(field),
@@ -268,7 +269,8 @@ def select_held_out_rays(
         is_held_out = split_by_person(rays, test_persons=holdout["people"])[1]
     elif split != "pos":
         raise NergError(
-            f'this training held out no participants, so the split "{split}" is empty; train with --test-participants'
+            f'this training held out no participants, so the split "{split}" is empty; train with '
+            f"{parameter('test_participants')}"
         )
     is_far = purge(rays, centres, holdout["purged_within"])
     train = rays.select(~is_held_out & is_far)
@@ -319,7 +321,8 @@ def make_test(
     has_enough = _has_enough_rays(rays, centres, radius, min_rays)
     if not has_enough.any():
         raise NergError(
-            f"none of {len(centres)} test positions has {min_rays} rays within {radius} m; reduce --min-rays"
+            f"none of {len(centres)} test positions has {min_rays} rays within {radius} m; reduce "
+            f"{parameter('min_rays')}"
         )
     probes = place_probes(
         rays,
@@ -337,8 +340,8 @@ def make_test(
     P, N = len(probes), len(present)
     if (size := P * directions * (4 * N + _BYTES_PER_METHOD)) > _MAX_BYTES:
         raise NergError(
-            f"maps of {directions:,} directions at {P} positions for {N} participants need {size / 1e9:.0f} GB; use "
-            "fewer --directions (a few thousand are enough)"
+            f"maps of {directions:,} directions at {P} positions for {N} participants need {size / 1e9:.0f} GB; "
+            f"use fewer {parameter('directions')} (a few thousand are enough)"
         )
     participant_densities, counts = np.zeros((P, N, directions), np.float32), np.zeros((P, N))
     probe = np.repeat(np.arange(P), probes.counts)

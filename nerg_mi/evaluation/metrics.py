@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError, translate_mitsuba_errors
+from nerg_mi.errors import NergError, parameter, translate_mitsuba_errors
 from nerg_mi.figures.overlay import srgb, write_png
 from nerg_mi.figures.style import make_provenance
 from nerg_mi.files.atomic import make_folder
@@ -245,7 +245,8 @@ def score_views(
     """
     if not views:
         raise NergError(
-            "the data set has no held-out views to score; use --holdout 8, or --train to score training views"
+            f"the data set has no held-out views to score; use {parameter('holdout', 8)}, or "
+            f"{parameter('train', True)} to score training views"
         )
     render, rows, depths = FieldRenderer(field, spp), [], []
     text: dict[str, str] = {}

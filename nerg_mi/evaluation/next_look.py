@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.maths import vmf
 from nerg_mi.maths.sphere import aim, fibonacci_directions, sample_uniform_directions
 from nerg_mi.probes.probes import compute_participant_weights
@@ -433,7 +433,9 @@ class NextLook:
             If the times do not increase, or the model is one given the head.
         """
         if self.gaze_in_head is not None:
-            raise NergError("this model predicts gaze from heads and simulates no looks; fit one without --head")
+            raise NergError(
+                f"this model predicts gaze from heads and simulates no looks; fit one without {parameter('head', True)}"
+            )
         times, positions = np.asarray(times, float), np.asarray(positions, float)
         if len(times) != len(positions) or not (np.diff(times) > 0).all():
             raise NergError(
@@ -530,7 +532,9 @@ def fit_next_look(
     times = np.asarray(knots, float)
     shape = interpolation_weights(times, elapsed)
     if not shape.any(axis=0).all():
-        raise NergError(f"no look has another one about {times[~shape.any(axis=0)][0]:g} s before; change --elapsed")
+        raise NergError(
+            f"no look has another one about {times[~shape.any(axis=0)][0]:g} s before; change {parameter('elapsed')}"
+        )
     weights = np.full((len(times), len(components)), 1 / len(components))
     previous = -np.inf
     for _ in range(iterations):

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import drjit as dr
 import numpy as np
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.maths.arrays import copy_aligned
 from nerg_mi.maths.types import Array3f, UInt32
 
@@ -86,7 +86,7 @@ def compile_density(
 def _describe_excess(resolution: int, size: float, limit: float) -> str:
     return (
         f"voxels of the resolution {resolution} would take {size / 1e6:.0f} MB, more than the limit of "
-        f"{limit / 1e6:.0f} MB; use a lower resolution or a higher --memory"
+        f"{limit / 1e6:.0f} MB; use a lower resolution or a higher {parameter('memory')}"
     )
 
 

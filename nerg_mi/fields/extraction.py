@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import drjit as dr
 import numpy as np
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.maths.arrays import to_vector
 
 from .radiance import RadianceField
@@ -46,7 +46,7 @@ class Lattice:
         if (cells := math.prod(shape.tolist())) > _MAX_CELLS:
             raise NergError(
                 f"a lattice of {' x '.join(map(str, shape))} cells takes {4 * cells / 1e9:.0f} GB; use a lower "
-                "--resolution"
+                f"{parameter('resolution')}"
             )
         # The overhang of the last cells is shared by both sides.
         lower = (np.add(core.upper, core.lower) - shape * step) / 2

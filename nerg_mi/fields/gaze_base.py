@@ -553,7 +553,7 @@ class GazeEnsemble(AnyGazeField):
         if any(m.hits is not None for m in self.members):
             raise ValueError(
                 "a member of an ensemble of gaze fields has re-aimed hits, which belong to the whole ensemble; train "
-                "the members with --no-reaimed-hits"
+                "the members with reaimed_hits=False"
             )
         if any(_common(m) != _common(self.members[0]) for m in self.members):
             raise ValueError(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import drjit as dr
 import numpy as np
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.maths.arrays import sigmoid
 from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.maths.types import Bool, Float
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 EMPTY = (
-    "is empty: no cell of its occupancy has density, because its training was too short or did not converge; train it "
-    "longer with --steps or --minutes"
+    "is empty: no cell of its occupancy has density, because its training was too short or did not converge; "
+    f"train it longer with {parameter('steps')} or {parameter('minutes')}"
 )
 """What an empty radiance field is, as the end of a sentence."""
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.fields.gaze_base import TRACKING_NOTES
 
 from .style import (
@@ -416,11 +416,13 @@ def floor_plan(rays, cell: float | None = None, title: str = "Participants' posi
     size = high - low
     cell = max(0.05, round(float(size.min()) / 50, 2)) if cell is None else cell
     if not 0 < cell < np.inf:
-        raise NergError(f"the edge length of a cell must be positive, in metres; got {cell:g} (--cell-size)")
+        raise NergError(
+            f"the edge length of a cell must be positive, in metres; got {cell:g} ({parameter('cell_size')})"
+        )
     if not np.prod(size / cell + 1) <= _MAX_CELLS:
         raise NergError(
             f"a plan of {size[0]:.4g} x {size[1]:.4g} m has more than {_MAX_CELLS:,} cells of {cell:g} m; choose "
-            "larger cells (--cell-size)"
+            f"larger cells ({parameter('cell_size')})"
         )
     edges = [np.arange(a, b + cell, cell) for a, b in zip(low, high)]
     counts, *_ = np.histogram2d(xy[:, 0], xy[:, 1], edges)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.files import images
 from nerg_mi.maths.color import encode_srgb
 from nerg_mi.ranges import LOG_DECADES
@@ -87,8 +87,8 @@ class Heat:
     def __post_init__(self):
         if not (np.isfinite(self.vmax) and self.vmax > 0):
             raise NergError(
-                f"the upper end of a heat map's scale must be positive, got {self.vmax}; set --vmax to a positive "
-                "number, or use data that are not 0 everywhere"
+                f"the upper end of a heat map's scale must be positive, got {self.vmax}; set {parameter('vmax')} "
+                "to a positive number, or use data that are not 0 everywhere"
             )
         if not 0 <= self.decades <= MAX_DECADES:
             raise NergError(f"a scale has 0 (linear) to {MAX_DECADES:.0f} decades, got {self.decades}")
@@ -122,7 +122,9 @@ def robust_max(values, mask, percentile: float = 99.5) -> float:
     if top <= 0 and masked.size:
         top = float(masked.max())  # the percentile may exclude all pixels with attention
     if not top > 0:
-        raise NergError("this image contains no gaze to derive a scale from; move the camera or set --vmax")
+        raise NergError(
+            f"this image contains no gaze to derive a scale from; move the camera or set {parameter('vmax')}"
+        )
     return top
 
 
@@ -593,7 +595,8 @@ class Overlay:
         """Raise `NergError` if there are no values to derive a scale from."""
         if limits is None and self.needs_limits:
             raise NergError(
-                f'"{self.name}" is 0 on all visible surfaces; move the camera or the observer, or give --vmax'
+                f'"{self.name}" is 0 on all visible surfaces; move the camera or the observer, or give '
+                f"{parameter('vmax')}"
             )
 
     def heat(self, limits: Limits, style: Style = DEFAULT_STYLE) -> Heat:

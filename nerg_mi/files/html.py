@@ -9,6 +9,8 @@ import base64
 import html
 from collections.abc import Iterable, Sequence
 
+from nerg_mi.errors import spell_parameters
+
 VOID_ELEMENTS = ("img", "br", "hr", "meta", "input")
 """Elements without content."""
 
@@ -31,7 +33,8 @@ def markup(content: Content) -> Html:
     if isinstance(content, Html):
         return content
     if isinstance(content, str):
-        return Html(html.escape("".join(c if c.isprintable() else " " if c == "\n" else "?" for c in content)))
+        text = spell_parameters(content)
+        return Html(html.escape("".join(c if c.isprintable() else " " if c == "\n" else "?" for c in text)))
     if isinstance(content, (int, float)):
         return Html(html.escape(str(content)))
     return Html("".join(markup(part) for part in content))

@@ -12,7 +12,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from nerg_mi.errors import NergError, import_extra, sanitize
+from nerg_mi.errors import NergError, import_extra, parameter, sanitize
 
 from .atomic import replace_atomically
 from .safe_read import check_regular_file, translate_read_errors
@@ -229,7 +229,9 @@ def check_video_output(fps: float) -> None:
     """
     _import_pyav()
     if not (np.isfinite(fps) and 0 < fps <= _MAX_FPS):
-        raise NergError(f"a video has at most {_MAX_FPS:.0f} frames per second, got {fps}; use for example --fps 25")
+        raise NergError(
+            f"a video has at most {_MAX_FPS:.0f} frames per second, got {fps}; use for example {parameter('fps', 25)}"
+        )
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from nerg_mi.errors import NergError, sanitize
+from nerg_mi.errors import NergError, parameter, sanitize
 from nerg_mi.fields.encoding import HashGrid, HashGridConfig
 from nerg_mi.fields.gaze_base import (
     MAX_WEIGHT,
@@ -155,7 +155,7 @@ def to_stored_arrays(parameters: Mapping[str, Any], half: bool) -> dict[str, np.
                 "train with a lower learning rate"
             )
         if not np.all(np.isfinite(out[name])):
-            raise NergError(f'the weight array "{name}" exceeds the range of fp16; omit --half')
+            raise NergError(f'the weight array "{name}" exceeds the range of fp16; omit {parameter("half", True)}')
     return out
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError, import_extra
+from nerg_mi.errors import NergError, import_extra, parameter
 from nerg_mi.fields.extraction import FieldSampler, Lattice, cell_opacity, find_crossings, surface_density
 from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.files.atomic import write_bytes
@@ -88,8 +88,8 @@ def extract_mesh(
     volume, filled = _close_holes(cell_opacity(density, lattice), level, fill_cells)
     if not volume.min() < level < volume.max():
         raise NergError(
-            f"the density does not cross {threshold:g} per unit (its range is {density.min():g} .. {density.max():g} "
-            f"on {lattice.shape} points): choose another --density-threshold"
+            f"the density does not cross {threshold:g} per unit (its range is {density.min():g} .. "
+            f"{density.max():g} on {lattice.shape} points): choose another {parameter('density_threshold')}"
         )
     index, faces, _, _ = measure.marching_cubes(volume.transpose(2, 1, 0), level, allow_degenerate=False)
     index, is_hidden = find_crossings(sampler, lattice, index.astype(np.float64), threshold)
@@ -98,8 +98,8 @@ def extract_mesh(
         faces = faces[is_hidden[faces].sum(1) < 2]
         if len(faces) == 0:
             raise NergError(
-                "no face of this surface has free space in front of it: the occupancy grid ends inside of the surface "
-                "everywhere; keep all faces with --keep-unseen"
+                "no face of this surface has free space in front of it: the occupancy grid ends inside of the "
+                f"surface everywhere; keep all faces with {parameter('keep_unseen', True)}"
             )
     num_visible = len(faces)
     body = trimesh.Trimesh(
@@ -212,8 +212,8 @@ def extract_points(
     index = np.concatenate(index)
     if len(index) == 0:
         raise NergError(
-            f"the density does not cross {threshold:g} per unit on {lattice.shape} points: "
-            "choose another --density-threshold"
+            f"the density does not cross {threshold:g} per unit on {lattice.shape} points: choose another "
+            f"{parameter('density_threshold')}"
         )
     if count is not None and count < len(index):
         index = index[np.sort(np.random.default_rng(seed).choice(len(index), count, replace=False))]

@@ -9,7 +9,7 @@ from types import ModuleType
 
 import numpy as np
 
-from nerg_mi.errors import NergError, sanitize
+from nerg_mi.errors import NergError, parameter, sanitize
 from nerg_mi.fields.encoding import HashGrid, HashGridConfig
 from nerg_mi.fields.gaze_product import GazeConfig, GazeField
 from nerg_mi.fields.mlp import MLP
@@ -92,14 +92,14 @@ def find_averages(path: str | Path, checkpoint: dict, model: dict, use_averages:
     shadow = shadow if isinstance(shadow, list) else []
     if (not use_averages and use_averages is not None) or not shadow:
         if use_averages and not shadow:
-            raise NergError(f'"{path}" contains no moving averages: import its weights with --no-ema')
+            raise NergError(f'"{path}" contains no moving averages: import its weights with {parameter("ema", False)}')
         return {}
     # Buffers are not averaged; parameters are in the order of the state dictionary.
     names = [k for k in model if k.endswith((".embeddings", ".weight", ".bias"))]
     if [tuple(model[k].shape) for k in names] != [tuple(v.shape) for v in shadow]:
         raise NergError(
-            f'the {len(shadow)} moving averages of "{path}" do not match its {len(names)} weights: '
-            "import the weights with --no-ema"
+            f'the {len(shadow)} moving averages of "{path}" do not match its {len(names)} weights: import the '
+            f"weights with {parameter('ema', False)}"
         )
     return dict(zip(names, shadow))
 
@@ -155,9 +155,8 @@ def infer_grid_config(state: StateDict, name: str, finest: float, dimensions: in
     )
     if config.offsets() != offsets:
         raise NergError(
-            f'the levels of "{state.prefix}{name}" in "{state.path}" start at rows {offsets}, which does not match a '
-            "grid "
-            f"from 16 to {finest:g}: set its finest resolution with --finest-resolution"
+            f'the levels of "{state.prefix}{name}" in "{state.path}" start at rows {offsets}, which does not match '
+            f"a grid from 16 to {finest:g}: set its finest resolution with {parameter('finest_resolution')}"
         )
     return config
 
@@ -298,7 +297,8 @@ def build_radiance_field(
     for name in state.names():
         if name in ("encoder.params", "sigma_net.params", "color_net.params"):
             raise NergError(
-                f'"{state.path}" was trained with --tcnn or --ff, whose layout is not supported: train it without them'
+                f'"{state.path}" was trained with the option tcnn or ff, whose layout is not supported: train '
+                "it without them"
             )
     box, bound = _read_box(state)
     density, color = build_network(state, "sigma_net", ns), build_network(state, "color_net", ns)
@@ -341,8 +341,9 @@ def _build_background(state: StateDict, ns: ModuleType, options: ImportOptions, 
         return None
     if options.background_radius is None:
         raise NergError(
-            f'"{state.path}" has a background network, and torch-ngp does not store its radius: '
-            "set the radius of the training, such as --bg-radius 32, or --bg-radius 0 to ignore the background"
+            f'"{state.path}" has a background network, and torch-ngp does not store its radius: set the radius of '
+            f"the training, such as {parameter('bg_radius', 32)}, or {parameter('bg_radius', 0)} to ignore the "
+            "background"
         )
     if options.background_radius == 0:
         return None
@@ -463,9 +464,9 @@ def read_nerg(
     checkpoint, model = open_checkpoint(path)
     averaged = isinstance(checkpoint.get("ema"), dict) and bool(checkpoint["ema"])
     if ema is False and averaged:
-        raise NergError(f'"{path}" stores only the moving averages: import it without --no-ema')
+        raise NergError(f'"{path}" stores only the moving averages: import it without {parameter("ema", False)}')
     if ema and not averaged:
-        raise NergError(f'"{path}" contains no moving averages: import its weights with --no-ema')
+        raise NergError(f'"{path}" contains no moving averages: import its weights with {parameter("ema", False)}')
     state = StateDict(Path(path), model)
     with translate_build_errors(path):
         gaze = build_gaze_field(state, _read_variant(state, checkpoint.get("variant")), ns)

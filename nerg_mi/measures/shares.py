@@ -23,7 +23,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.maths.sphere import fibonacci_directions, indices_in_cone
 from nerg_mi.ranges import LENGTHS, check_number
 from nerg_mi.transport.observer_gaze import ERROR_EXPONENT, ERROR_PARTS
@@ -430,7 +430,7 @@ class VisibilityCache:
     """Memory limit of the cache."""
 
     def __init__(self, targets: SamplePoints, depth: DepthQuery, cell_size: float, margin: float):
-        check_number(cell_size, LENGTHS, "--cell-size")
+        check_number(cell_size, LENGTHS, parameter("cell_size"))
         self._targets, self._depth, self._cell, self._margin = targets, depth, cell_size, margin
         self._visibility: dict[tuple[int, int, int], np.ndarray] = {}
         self.num_traced = 0
@@ -472,7 +472,8 @@ def find_standing_positions(
     sides = [np.arange(a + step / 2, b, step) for a, b in zip(lower[:2], upper[:2])]
     if not 0 < len(sides[0]) * len(sides[1]) <= 4_000_000:
         raise NergError(
-            f"a grid of {step:g} m has {len(sides[0])} x {len(sides[1])} positions; choose another --grid-step"
+            f"a grid of {step:g} m has {len(sides[0])} x {len(sides[1])} positions; choose another "
+            f"{parameter('grid_step')}"
         )
     xy = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 2)
     positions = np.column_stack([xy, np.full(len(xy), floor + height)])

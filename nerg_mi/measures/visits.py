@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.formats.areas import Region
 from nerg_mi.maths.geometry import intersect_box_numpy
 from nerg_mi.maths.vmf import tangent_frame
@@ -301,17 +301,17 @@ class VisitRules:
 
     def __post_init__(self) -> None:
         options = {
-            "--max-gap": self.max_gap,
-            "--session-gap": self.session_pause,
-            "--merge-gap": self.merge_gap,
-            "--min-visit": self.min_visit,
+            parameter("max_gap"): self.max_gap,
+            parameter("session_gap"): self.session_pause,
+            parameter("merge_gap"): self.merge_gap,
+            parameter("min_visit"): self.min_visit,
         }
         for option, value in options.items():
             check_number(value, SECONDS, option)
         if not self.session_pause >= self.max_gap > 0:
             raise NergError(
-                f"--session-gap ({self.session_pause:g} s) must be at least --max-gap ({self.max_gap:g} s), "
-                "which must be positive"
+                f"{parameter('session_gap')} ({self.session_pause:g} s) must be at least {parameter('max_gap')} "
+                f"({self.max_gap:g} s), which must be positive"
             )
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.files.safe_read import resolve_path
 from nerg_mi.maths.geometry import AnyBox, Box, ContractedBox, intersect_box_numpy
 from nerg_mi.ranges import MAX_COORDINATE
@@ -212,7 +212,8 @@ def estimate_box(
     margin = 0.5 * float(np.max(upper - lower))
     if margin == 0:
         raise NergError(
-            "all cameras are at the same position, so the scene box cannot be estimated; set it with --aabb"
+            "all cameras are at the same position, so the scene box cannot be estimated; set it with "
+            f"{parameter('aabb')}"
         )
     return Box(tuple(lower - margin), tuple(upper + margin)), "around the cameras"
 
@@ -439,9 +440,9 @@ def open_dataset(
     unmatched = find_unmatched([v.camera for v in train], extent.box) if len(train) > 1 else []
     if len(unmatched) == len(train):
         raise NergError(
-            f'no two of the {len(train)} training frames of "{split.posed.path}" (the first: "{train[0].name}") show '
-            f"the same part of the box {_format_corners(extent.box)}; check the poses, or set a box that contains the "
-            "scene with --aabb"
+            f'no two of the {len(train)} training frames of "{split.posed.path}" (the first: "{train[0].name}") '
+            f"show the same part of the box {_format_corners(extent.box)}; check the poses, or set a box that "
+            f"contains the scene with {parameter('aabb')}"
         )
     if unmatched:
         unusable += [UnusedFrame(train[k].name, "no other frame shows the same part of the scene") for k in unmatched]
@@ -484,9 +485,9 @@ def _check_depth(posed: PosedImages, views: list[PhotoView]) -> None:
     reason = explain_wrong_depth(views_with_depth) if views_with_depth else None
     if reason is not None:
         raise NergError(
-            f'the depth of "{posed.path}" does not match its cameras: {reason}; correct "depth_unit_scale_factor", the '
-            "length of a unit of the depth files in metres (default: 0.001, for EXR 1), or disable depth with "
-            "--no-depth"
+            f'the depth of "{posed.path}" does not match its cameras: {reason}; correct "depth_unit_scale_factor", '
+            "the length of a unit of the depth files in metres (default: 0.001, for EXR 1), or disable depth with "
+            f"{parameter('depth', False)}"
         )
 
 
@@ -557,9 +558,8 @@ def _describe_up(up: UpEstimate) -> str:
         return f"up is +z to {off:.1f} degrees ({up})"
     direction = ", ".join(f"{x:.2f}" for x in up.direction)
     return (
-        f"up is ({direction}), {off:.0f} degrees from +z, which tracking data requires ({up}); --coordinates upright "
-        "rotates "
-        "the scene"
+        f"up is ({direction}), {off:.0f} degrees from +z, which tracking data requires ({up}); "
+        f"{parameter('coordinates', 'upright')} rotates the scene"
     )
 
 
@@ -573,4 +573,4 @@ def _describe_unit(posed: PosedImages, views: list[PhotoView], box: AnyBox, scal
         return f"{extent}; a unit of the data set is scaled to {scale:g}"
     if any(f.depth is not None for f in posed.frames):
         return f"{extent}; a unit is a metre if the scale factor of the depth files is in metres"
-    return f"{extent}; if a unit is not a metre, set its length in metres with --scale"
+    return f"{extent}; if a unit is not a metre, set its length in metres with {parameter('scale')}"

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nerg_mi.errors import MissingFile, NergError, sanitize
+from nerg_mi.errors import MissingFile, NergError, format_error, sanitize
 from nerg_mi.files.images import check_image, read_exr
 from nerg_mi.files.safe_read import is_regular_file, read_npy, resolve_path, translate_read_errors
 from nerg_mi.maths.color import encode_srgb
@@ -349,7 +349,7 @@ def load_usable_views(
         try:
             views.append(load_view(frame, width, downscale, depth))
         except ValueError as e:
-            unused.append(UnusedFrame(frame.name, str(e)))
+            unused.append(UnusedFrame(frame.name, format_error(e)))
     return views, unused
 
 

@@ -13,7 +13,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from nerg_mi.errors import NergError, sanitize
+from nerg_mi.errors import NergError, parameter, sanitize
 from nerg_mi.files.safe_read import is_regular_file, read_line_blocks, resolve_path
 from nerg_mi.maths.coordinates import check_near_origin
 from nerg_mi.maths.transforms import check_rigid_transforms, nearest_rotation
@@ -46,8 +46,7 @@ def check_inside(root: Path | None, path: Path, file_kind: str) -> Path:
     if root is not None and not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(root)):
         raise NergError(
             f'its {file_kind} "{sanitize(path)}" is outside of the data set\'s folder "{root}"; move it there, or '
-            "allow this "
-            "with --allow-outside"
+            f"allow this with {parameter('allow_outside', True)}"
         )
     return path
 

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError, sanitize
+from nerg_mi.errors import NergError, parameter, sanitize
 from nerg_mi.files.atomic import write_bytes, write_text
 from nerg_mi.files.images import check_image
 from nerg_mi.files.safe_read import read_bytes, translate_read_errors
@@ -244,7 +244,7 @@ def copy_photos(
                 raise NergError("its file name contains unprintable characters, which COLMAP cannot store; rename it")
             pictures.append(_copy_photo(path, folders, len(pictures), max_side, seen, allow_outside))
         except NergError as error:
-            unused.append(UnusedFrame(path.name, str(error)))
+            unused.append(UnusedFrame(path.name, error.message))
         on_progress(k + 1, len(photos))
     return pictures, unused
 
@@ -513,8 +513,13 @@ def _explain_exit(code: int, error_output: str, work: Path) -> str:
     if shutil.disk_usage(work).free < 1 << 20:
         return f'COLMAP failed because the disk of "{work.parent.parent}" is full; free some space'
     if code == -signal.SIGKILL:
-        return "COLMAP was killed, probably because memory was short; use a smaller --max-image-size or fewer images"
+        return (
+            f"COLMAP was killed, probably because memory was short; use a smaller {parameter('max_image_size')} or "
+            "fewer images"
+        )
     lines = [line for line in error_output.splitlines() if line.strip()]
     # The message precedes the stack trace if a library aborts, and follows it if Python raises.
     message = next((line for line in lines if "Check failed" in line or "] " in line[:80]), lines[-1] if lines else "")
-    return f"COLMAP failed with exit code {code} ({sanitize(message, 200)}); try --threads 1 or other photos"
+    return (
+        f"COLMAP failed with exit code {code} ({sanitize(message, 200)}); try {parameter('threads', 1)} or other photos"
+    )

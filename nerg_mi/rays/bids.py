@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError, sanitize
+from nerg_mi.errors import NergError, parameter, sanitize
 from nerg_mi.files.atomic import create_folder_atomically, write_bytes, write_text
 from nerg_mi.files.tables import write_json
 
@@ -92,7 +92,9 @@ def write_bids(
         a folder that is not empty, and for directions of heads.
     """
     if not re.fullmatch("[0-9a-zA-Z]+", task):
-        raise NergError(f'the label of a task is made of letters and digits, not "{sanitize(task, 40)}"; change --task')
+        raise NergError(
+            f'the label of a task is made of letters and digits, not "{sanitize(task, 40)}"; change {parameter("task")}'
+        )
     if rays.tracking in ("head", "mixed"):
         raise NergError(
             f"BIDS describes eye tracking, but these rays are {TRACKING[rays.tracking]}; export those of eyes; "

@@ -15,6 +15,8 @@ from functools import cached_property
 
 import numpy as np
 
+from nerg_mi.errors import parameter
+
 from .filters import Sessions, find_frozen_gaze, find_sessions
 from .rays import Rays
 from .readers.base import UNITS
@@ -205,7 +207,7 @@ def _check_overlaps(stats: RayStatistics) -> list[str]:
     names = list_persons(rays, np.unique(person[1:][overlap]))
     return [
         f"recordings of {names} overlap in time: do several participants or several clocks share a name? "
-        "(--person-from filename, or --map person=...)"
+        f"({parameter('person_from', 'filename')}, or {parameter('columns', 'person=...')})"
     ]
 
 
@@ -232,7 +234,7 @@ def _check_duplicates(stats: RayStatistics) -> list[str]:
     if np.mean(is_elsewhere := distance > _MIN_DISTANCE) > 0.5:
         out.append(
             f"{names(is_elsewhere)} is at two positions at the same time: do several participants share a name? "
-            "(--person-from filename, or --map person=...)"
+            f"({parameter('person_from', 'filename')}, or {parameter('columns', 'person=...')})"
         )
     return out
 
@@ -263,7 +265,7 @@ def _check_clock_rates(stats: RayStatistics) -> list[str]:
         names = list_persons(rays, np.flatnonzero(differs(person_interval / typical)))
         out.append(
             f"the sampling interval of {names} is {person_interval[p]:.3g} s, that of other participants "
-            f"{typical:.3g} s: does their clock use another unit? Import them separately (--tick)"
+            f"{typical:.3g} s: does their clock use another unit? Import them separately ({parameter('tick')})"
         )
     is_odd = differs(interval / person_interval[person])
     has_changes = np.bincount(person[is_odd], minlength=count) > np.maximum(
@@ -291,8 +293,8 @@ def _check_epochs(stats: RayStatistics) -> list[str]:
     minority = np.unique(min(person[cut:], person[:cut], key=len))
     names = list_persons(rays, minority)
     return [
-        f"the clock of {names} starts from another epoch than that of the other participants: split each participant "
-        "by time separately (--clock person)"
+        f"the clock of {names} starts from another epoch than that of the other participants: split each "
+        f"participant by time separately ({parameter('clock', 'person')})"
     ]
 
 
@@ -335,7 +337,7 @@ def check_eyes(stats: RayStatistics) -> list[str]:
         if u != declared and metres / _UNIT_TOLERANCE <= size <= metres * _UNIT_TOLERANCE
     ]
     if matching_units:
-        remedy = f"is the unit {matching_units[0]}? (--units {matching_units[0]})"
+        remedy = f"is the unit {matching_units[0]}? ({parameter('units', matching_units[0])})"
     else:
         remedy = f"the unit of length of the file is about {size:.2g} m: scale its positions by this factor"
     return [
@@ -402,15 +404,16 @@ def check_lengths(stats: RayStatistics) -> list[str]:
     if not extent.any() and len(stats.rays) > 1:
         position = ", ".join(f"{v:.3g}" for v in stats.rays.origin[0] + 0.0)
         return [
-            f"all origins are {position} m: the head's position was not recorded, or the gaze is in the head's frame; "
-            "map the position (origin) and the rotation of the head (--map), if the files contain them"
+            f"all origins are {position} m: the head's position was not recorded, or the gaze is in the head's "
+            f"frame; map the position (origin) and the rotation of the head ({parameter('columns')}), if the files "
+            "contain them"
         ]
     if 100 <= median <= 230:
-        out.append(f"the median height is {median:.0f} m: is the unit centimetres? (--units cm)")
+        out.append(f"the median height is {median:.0f} m: is the unit centimetres? ({parameter('units', 'cm')})")
     elif extent.max() > 1000 or 1000 <= median <= 2300:
         out.append(
-            f"the origins span {extent.max():.0f} m, at a median height of {median:.0f} m: "
-            "is the unit millimetres? (--units mm)"
+            f"the origins span {extent.max():.0f} m, at a median height of {median:.0f} m: is the unit "
+            f"millimetres? ({parameter('units', 'mm')})"
         )
     elif extent.max() < 0.05 and len(stats.rays) >= MIN_RAYS:
         out.append(f"the origins span only {extent.max():.3f} m: is the unit larger than declared?")
@@ -424,7 +427,7 @@ def check_lengths(stats: RayStatistics) -> list[str]:
         )
         axis = _find_height_axis(stats.rays)
         remedy = (
-            f"{axis} of the file has the values of a head's height: is it the up axis? (--up {axis})"
+            f"{axis} of the file has the values of a head's height: is it the up axis? ({parameter('up', axis)})"
             if axis
             else "check the up axis and the unit; otherwise the floor is not at height 0"
         )
@@ -468,8 +471,8 @@ def check_participants(stats: RayStatistics) -> list[str]:
     if stats.is_subsampled or len(rays) < MIN_RAYS or np.median(rays) > _MAX_RAYS_OF_COUNTER:
         return []
     return [
-        f"{len(rays):,} participants have only {len(stats.rays):,} rays in total: does their column count rows? (leave "
-        "person out of --map, so that each file is one participant)"
+        f"{len(rays):,} participants have only {len(stats.rays):,} rays in total: does their column count rows? "
+        f"(leave person out of {parameter('columns')}, so that each file is one participant)"
     ]
 
 
@@ -485,24 +488,30 @@ def check_times(stats: RayStatistics) -> list[str]:
     speed, step, out = stats.speed_p95, stats.median_interval, []
     if speed > 5:
         out.append(
-            f"5 % of the steps are faster than {speed:.1f} m/s, which is above walking pace: "
-            "check the unit of time (--tick) or of length"
+            f"5 % of the steps are faster than {speed:.1f} m/s, which is above walking pace: check the unit of "
+            f"time ({parameter('tick')}) or of length"
         )
     if step is None or np.isnan(step):
         if step is not None:
-            out.append("all rays of a participant have the same time: is the column of time correct? (--map t=...)")
+            out.append(
+                "all rays of a participant have the same time: is the column of time correct? "
+                f"({parameter('columns', 't=...')})"
+            )
         return out
     # With most intervals above one second, hardly any time counts as recorded.
     if not 1e-4 <= step <= 1.0:
         tick = stats.rays.metadata.get("tick", 1.0)
         rates = {1 / (step * f): f for f in (1e-3, 1e-6, 1e-7, 1e-9, 1e3, 60.0)}
         factors = {rate: f for rate, f in rates.items() if _DEVICE_RATES[0] <= rate <= _DEVICE_RATES[1]}
-        remedy = "check the unit of time (--tick)"
+        remedy = f"check the unit of time ({parameter('tick')})"
         if factors:
             # Microseconds of 60 Hz are also 600 Hz in the ticks of .NET, and these are also 6 Hz in microseconds.
             rate = min(factors, key=lambda rate: abs(math.log(rate / _COMMON_RATE)))
             unit = tick * factors[rate]
-            remedy = f"with a unit of time of {unit:g} s the sampling rate would be {rate:.3g} Hz (--tick {unit:g})"
+            remedy = (
+                f"with a unit of time of {unit:g} s the sampling rate would be {rate:.3g} Hz "
+                f"({parameter('tick', f'{unit:g}')})"
+            )
         out.append(f"the median sampling interval is {step:.3g} s; {remedy}")
     return out
 

@@ -16,7 +16,7 @@ from urllib.parse import quote, unquote
 
 import numpy as np
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.files.atomic import file_sha256, write_text
 from nerg_mi.files.safe_read import (
     check_regular_file,
@@ -71,7 +71,8 @@ def check_place(place: str) -> str:
     """Return ``place``, an environment, if it is a valid name. Raises `NergError` otherwise."""
     if not place or len(place) > _MAX_PLACE_LENGTH or not place.isprintable() or place != place.strip():
         raise NergError(
-            f"the name of an environment has 1 to {_MAX_PLACE_LENGTH} characters, got {place[:80]!r} (--environment)"
+            f"the name of an environment has 1 to {_MAX_PLACE_LENGTH} characters, got {place[:80]!r} "
+            f"({parameter('environment')})"
         )
     return place
 
@@ -82,7 +83,7 @@ def check_day(day: str) -> str:
         if day != UNKNOWN and not (_DAY.fullmatch(day) and np.datetime64(day, "D")):
             raise ValueError
     except ValueError:
-        raise NergError(f"a day is written as 2026-11-22, got {day[:40]!r} (--day)") from None
+        raise NergError(f"a day is written as 2026-11-22, got {day[:40]!r} ({parameter('day')})") from None
     return day
 
 
@@ -699,8 +700,9 @@ class RayDataset:
     def _too_many(self, count: str, max_rays: int) -> NergError:
         return NergError(
             f'"{self.folder}" has {count} such rays, more than the maximum of {max_rays:,} '
-            f"({max_rays * BYTES_PER_RAY / 1e9:.2g} GB): select rays with 'nerg rays filter' (--box, --person, "
-            "--start, or --sample), or use one day of the dataset"
+            f"({max_rays * BYTES_PER_RAY / 1e9:.2g} GB): select rays with 'nerg rays filter' ({parameter('box')}, "
+            f"{parameter('persons')}, {parameter('start')}, or {parameter('sample')}), or use one day of the "
+            "dataset"
         )
 
     def sample(self, n: int, seed: int = 0, *, runs: int | None = None, read_hits: bool = True) -> Rays:

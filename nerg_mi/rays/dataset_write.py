@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.files.atomic import (
     check_folder,
     file_sha256,
@@ -154,8 +154,9 @@ class SourceWriter:
         max_coordinate = float(np.abs(rays.origin).max())
         if max_coordinate > MAX_COORDINATE:
             raise NergError(
-                f"origins are up to {max_coordinate:.3g} m from zero, beyond the maximum of {MAX_COORDINATE:g} m of a "
-                "dataset: check the unit (--units), or move the origin of the frame into the environment"
+                f"origins are up to {max_coordinate:.3g} m from zero, beyond the maximum of {MAX_COORDINATE:g} m "
+                f"of a dataset: check the unit ({parameter('units')}), or move the origin of the frame into the "
+                "environment"
             )
         for name in (*rays.persons, *rays.cohorts):
             if not _is_encodable(name):
@@ -484,8 +485,8 @@ def run_tasks(tasks: Sequence[ImportTask], workers: int) -> Iterator[ImportOutco
                 yield done.result()
         except BrokenProcessPool as error:
             raise NergError(
-                "a worker process was killed or could not start: use fewer --workers if memory was short; in a "
-                'script, import below if __name__ == "__main__"; finished sources are kept'
+                f"a worker process was killed or could not start: use fewer {parameter('workers')} if memory was "
+                'short; in a script, import below if __name__ == "__main__"; finished sources are kept'
             ) from error
 
 
@@ -631,11 +632,15 @@ def _check_compatible(folder: Path, recipe: ImportRecipe) -> None:
         raise NergError(f'"{folder}" was filtered from another dataset: import into that one, and filter it again')
     if head.salt == _RANDOM_SALT:
         raise NergError(
-            f'the pseudonyms in "{folder}" have a random salt that was discarded, so that nothing can be '
-            "added: import all files into a new dataset, with --salt FILE to add more later"
+            f'the pseudonyms in "{folder}" have a random salt that was discarded, so that nothing can be added: '
+            f"import all files into a new dataset, with {parameter('salt', 'FILE')} to add more later"
         )
     if head.salt != salt_digest:
-        remedy = "leave out --pseudonyms" if head.salt is None else "use the same --pseudonyms --salt FILE"
+        remedy = (
+            f"leave out {parameter('pseudonyms', True)}"
+            if head.salt is None
+            else f"use the same {parameter('pseudonyms', True)} {parameter('salt', 'FILE')}"
+        )
         raise NergError(f'participants would get other names than those in "{folder}": {remedy}')
 
 

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from nerg_mi.errors import parameter
+
 from .checks import (
     MAX_CHECKED_RAYS,
     MIN_RAYS,
@@ -104,7 +106,7 @@ def _check_heights(stays: _SessionPositions, reported: np.ndarray) -> tuple[list
     ratio = abs(height / typical) if typical else 0.0
     unit = next((name for name, size in (("cm", 100), ("mm", 1000)) if 0.7 < ratio / size < 1.4), None)
     remedy = (
-        f"is their unit {unit}? Import them separately (--units {unit})"
+        f"is their unit {unit}? Import them separately ({parameter('units', unit)})"
         if unit
         else "do they have another floor or origin? Import them separately, and align them (nerg align)"
     )
@@ -165,8 +167,11 @@ def _check_floors(stays: _SessionPositions, reported: np.ndarray) -> tuple[list[
             is_odd[members] = True
             names.setdefault(best, []).extend(stays.name[s] for s in members)
     return [
-        f"{list_names(odd_names)} walks where no other participant does; with {change} (of rays) the positions "
-        "would match: is this another frame? Import it separately (--up, --hand), or align it (nerg align)"
+        (
+            f"{list_names(odd_names)} walks where no other participant does; with {change} (of rays) the positions "
+            f"would match: is this another frame? Import it separately ({parameter('up')}, {parameter('handedness')}), "
+            "or align it (nerg align)"
+        )
         for change, odd_names in names.items()
     ], is_odd
 
@@ -261,13 +266,14 @@ def _check_following(stats: RayStatistics, heads: np.ndarray, has_head: np.ndarr
         which = " and ".join("xyz"[i] for i in np.flatnonzero(axes))
         out.append(
             f"along {which} of the file the gaze of {names} moves opposite to the head: negate {which} of the "
-            "directions, or check their frame (--hand)"
+            f"directions, or check their frame ({parameter('handedness')})"
         )
     if is_unrelated.any():
         names = list_persons(rays, np.flatnonzero(is_unrelated.any(axis=0)))
         out.append(
             f"the gaze of {names} does not follow the head: check whether it is in the head's frame "
-            "(--preset unity_local, or the head's pose in --map), and whether the head is of the same participant"
+            f"({parameter('preset', 'unity_local')}, or the head's pose in {parameter('columns')}), and whether "
+            "the head is of the same participant"
         )
     return out
 
@@ -280,7 +286,10 @@ def _suggest_mirror(stats: RayStatistics, heads: np.ndarray, rows: np.ndarray) -
     for signs in _SIGNS[1:]:
         if np.mean(np.einsum("ij,ij->i", head, d * signs) < _MIN_COSINE) < 0.5 * _MIN_BEYOND_FRACTION:
             which = f"{_name_negated_axes(signs)} of the directions"
-            return f"with {which} negated this would not occur: check their frame (--hand, --forward)"
+            return (
+                f"with {which} negated this would not occur: check their frame ({parameter('handedness')}, "
+                f"{parameter('forward')})"
+            )
     return ""
 
 
@@ -293,17 +302,20 @@ def _suggest_frame(stats: RayStatistics, heads: np.ndarray, rows: np.ndarray) ->
     if in_world > _MIN_CONCENTRATED_LENGTH and in_head < _MAX_DISPERSED_LENGTH:
         return (
             "they keep one direction of the file however the head turns: are they in the head's frame? "
-            "(--preset unity_local, or the head's pose in --map)"
+            f"({parameter('preset', 'unity_local')}, or the head's pose in {parameter('columns')})"
         )
     if in_head > _MIN_CONCENTRATED_LENGTH and in_world < _MAX_DISPERSED_LENGTH:
         ahead, right, up = gaze_in_head.mean(axis=0)
         side = max(
             {"back": -ahead, "right": right, "left": -right, "up": up, "down": -up}.items(), key=lambda at: at[1]
         )[0]
-        return f"relative to the head they point {side}: is another axis of the head its forward axis? (--forward)"
+        return (
+            f"relative to the head they point {side}: is another axis of the head its forward axis? "
+            f"({parameter('forward')})"
+        )
     return (
-        "check the order of the quaternion (xyzw or wxyz), and whether the directions are already in the world frame "
-        "(--preset unity, or direction without a pose in --map)"
+        "check the order of the quaternion (xyzw or wxyz), and whether the directions are already in the world "
+        f"frame ({parameter('preset', 'unity')}, or direction without a pose in {parameter('columns')})"
     )
 
 
@@ -353,8 +365,9 @@ def check_vor(stats: RayStatistics) -> list[str]:
 
 def _describe_swap(swap: str, suffix: str) -> str:
     return (
-        f"the gaze{suffix} turns with the head instead of against it; with {swap} of the eyes swapped it would "
-        "be stable: negate that component of the direction in the head's frame, or check the frame (--hand)"
+        f"the gaze{suffix} turns with the head instead of against it; with {swap} of the eyes swapped it would be "
+        "stable: negate that component of the direction in the head's frame, or check the frame "
+        f"({parameter('handedness')})"
     )
 
 
@@ -500,7 +513,7 @@ def describe_mirroring(fractions: dict[str, float], count: int) -> str | None:
         return None
     return (
         f"{100 * declared:.1f} % of the gaze ends on a surface; with {best} of the directions negated it would be "
-        f"{100 * single[best]:.1f} %: is the frame mirrored? (--hand, or the sign of {best})"
+        f"{100 * single[best]:.1f} %: is the frame mirrored? ({parameter('handedness')}, or the sign of {best})"
     )
 
 
@@ -533,7 +546,7 @@ def find_walking_disagreements(stats: RayStatistics) -> list[str]:
     if rays.head is None and _is_gaze_fixed(steps):
         return [
             "the directions keep one direction of the file, whichever way people walk: are they in the head's "
-            "frame? (--preset unity_local, or the head's pose in --map)"
+            f"frame? ({parameter('preset', 'unity_local')}, or the head's pose in {parameter('columns')})"
         ]
     if message := _describe_disagreement(_correlate_steps(steps), "people", _MIN_CORRELATION):
         return [message]
@@ -548,8 +561,9 @@ def find_walking_disagreements(stats: RayStatistics) -> list[str]:
     out = [text.replace("{}", list_names(names)) for text, names in names_by_message.items()]
     if fixed:
         out.append(
-            f"the directions of {list_names(fixed)} keep one direction of the file, whichever way they walk; those of "
-            "others do not: are they in the head's frame? (--preset unity_local, or the head's pose in --map)"
+            f"the directions of {list_names(fixed)} keep one direction of the file, whichever way they walk; those "
+            f"of others do not: are they in the head's frame? ({parameter('preset', 'unity_local')}, or the head's "
+            f"pose in {parameter('columns')})"
         )
     return out
 
@@ -559,11 +573,11 @@ def _describe_disagreement(correlations: np.ndarray, subject: str, min_correlati
     along = [i for i in range(3) if correlations[i] > _MIN_CORRELATION]
     if against and not along:
         verb = "look opposite to their direction of walking"
-        return f"{subject} {verb}: are the directions reversed? (--forward, or the sign of the direction)"
+        return f"{subject} {verb}: are the directions reversed? ({parameter('forward')}, or the sign of the direction)"
     if against:
         return (
-            f"along {' and '.join('xyz'[i] for i in against)} of the file {subject} look opposite to their walking: "
-            "are positions and directions mirrored relative to each other? (--hand)"
+            f"along {' and '.join('xyz'[i] for i in against)} of the file {subject} look opposite to their "
+            f"walking: are positions and directions mirrored relative to each other? ({parameter('handedness')})"
         )
     return ""
 

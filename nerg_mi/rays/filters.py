@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.files.values import find_names, to_numbers
 
 from .rays import RayIndex, Rays
@@ -58,7 +58,9 @@ def select_mask(
         keep &= ~np.isin(rays.person, find_names(without_persons, rays.persons, "person"))
     if cohorts is not None:
         if rays.cohort is None:
-            raise NergError("these rays have no cohorts; import them with a cohort column (--map cohort=...)")
+            raise NergError(
+                f"these rays have no cohorts; import them with a cohort column ({parameter('columns', 'cohort=...')})"
+            )
         keep &= np.isin(rays.cohort, find_names(cohorts, rays.cohorts, "cohort"))
     if box is not None:
         sides = to_numbers(box, "a box")

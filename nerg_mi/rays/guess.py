@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError, sanitize
+from nerg_mi.errors import NergError, parameter, sanitize
 from nerg_mi.files.safe_read import read_line_blocks, resolve_path
 
 from .filters import estimate_interval
@@ -686,7 +686,9 @@ def _find_time(out: Proposal, sample: TableSample, roles: Roles) -> tuple[str | 
         if unreadable := next((c for c in roles.times if c in sample.columns), None):
             cell = sanitize(next(iter(sample.read_texts(unreadable)), ""), 40)
             reason = f"{unreadable!r} contains {cell!r}, which is neither a number nor like 2024-05-01T12:00:00.25"
-        out.questions.append(f"the time: {reason}; without t= rows are numbered, and --tick is the sampling interval")
+        out.questions.append(
+            f"the time: {reason}; without t= rows are numbered, and {parameter('tick')} is the sampling interval"
+        )
         return None, None
     times = sample.numbers[name]
     rate = _find_rate(times)
@@ -704,14 +706,14 @@ def _find_time(out: Proposal, sample: TableSample, roles: Roles) -> tuple[str | 
     elif clock:
         out.assumptions.append(f"{name!r} is the time, in {_TIME_UNITS[clock[0]]}: its values are {clock[1]}")
     elif detected:
-        others = [f"{_TIME_UNITS[t]} ({rate / t:.3g} Hz, --tick {t:g})" for t in units[1:]]
+        others = [f"{_TIME_UNITS[t]} ({rate / t:.3g} Hz, {parameter('tick', f'{t:g}')})" for t in units[1:]]
         out.assumptions.append(
             f"{name!r} is the time, in {_TIME_UNITS[detected]}: the sampling rate is {rate / detected:.3g} Hz"
             + (f"; it may also be in {' or '.join(others)}" if others else "")
         )
     else:
         out.questions.append(
-            f"the unit of the time {name!r}: no unit gives the sampling rate of a device (--tick, seconds)"
+            f"the unit of the time {name!r}: no unit gives the sampling rate of a device ({parameter('tick')}, seconds)"
         )
     if named_unit and detected and named_unit not in (detected, *units):
         evidence = "values" if clock else "sampling rate"
@@ -726,8 +728,8 @@ def _question_rate(out: Proposal, name: str, rate: float, unit: str) -> None:
     """Ask whether the time is right if its sampling rate in Hz is implausible."""
     if np.isfinite(rate) and not _is_plausible_rate(rate):
         out.questions.append(
-            f"whether {name!r} is the time, in {unit}: the sampling rate is {rate:.3g} Hz, which trackers do not have "
-            "(--tick, or another column as t=)"
+            f"whether {name!r} is the time, in {unit}: the sampling rate is {rate:.3g} Hz, which trackers do not "
+            f"have ({parameter('tick')}, or another column as t=)"
         )
 
 
@@ -749,8 +751,8 @@ def _propose_frame(out: Proposal, upright: UpAxis | None, gravity_up: str | None
     if upright is None or (gravity_up is not None and upright.up != gravity_up):
         if gravity_up is None:
             out.questions.append(
-                "the up axis (--up), the handedness (--hand) and the unit (--units): there is not exactly one axis "
-                "along which the rows stay at eye height"
+                f"the up axis ({parameter('up')}), the handedness ({parameter('handedness')}) and the unit "
+                f"({parameter('units')}): there is not exactly one axis along which the rows stay at eye height"
             )
             out.options |= {"--up": "UP", "--hand": "HAND", "--units": "UNIT"}
             return {}
@@ -800,7 +802,7 @@ def _propose_pose(
     if forward is None:
         usual_one = f"{default} is usual in such a frame" if default else "it depends on the frame"
         out.questions.append(
-            f"the forward axis of heads (--forward): {usual_one}, and there is no walking to confirm it"
+            f"the forward axis of heads ({parameter('forward')}): {usual_one}, and there is no walking to confirm it"
         )
     if gaze is None or is_known_local:
         return is_known_local or None
@@ -842,8 +844,8 @@ def _propose_validity(out: Proposal, sample: TableSample) -> None:
         valid = find_valid_values(name, values)
         if valid is None or any(c in name + "".join(valid) for c in ",="):
             out.questions.append(
-                f"which values of {name!r} mark valid rows (--valid): {', '.join(map(repr, values[:8]))}"
-                f"{', ...' if len(values) > 8 else ''}"
+                f"which values of {name!r} mark valid rows ({parameter('valid')}): "
+                f"{', '.join(map(repr, values[:8]))}{', ...' if len(values) > 8 else ''}"
             )
         elif valid:
             out.assumptions.append(f"rows are valid where {name!r} is {' or '.join(valid)}")

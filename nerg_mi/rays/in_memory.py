@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nerg_mi.errors import NergError, sanitize
+from nerg_mi.errors import NergError, clean_text, sanitize
 from nerg_mi.files.dataframes import DataFrameReader, make_dataframe
 from nerg_mi.files.html import key_value_table
 from nerg_mi.files.values import is_missing, to_names, to_numbers, to_seconds
@@ -262,15 +262,17 @@ class QualityReport:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Sentences about implausible data, each with the likely mistake and its remedy."""
-        return self.summary.warnings
+        return tuple(map(clean_text, self.summary.warnings))
 
     @cached_property
     def lines(self) -> list[tuple[str, str]]:
         """Labels and texts of all lines."""
-        return [*make_quality_report(self.rays, self.summary), *self.notes]
+        return [(label, clean_text(text)) for label, text in make_quality_report(self.rays, self.summary)] + [
+            *self.notes
+        ]
 
     def __repr__(self) -> str:
-        return format_quality_report(self.rays, self.summary, self.title, self.notes)
+        return clean_text(format_quality_report(self.rays, self.summary, self.title, self.notes))
 
     def _repr_html_(self) -> str:
         return key_value_table(self.lines)

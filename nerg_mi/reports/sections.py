@@ -206,7 +206,7 @@ def _explain_absent_objects(run: Run) -> str | None:
         return None
     if run.geometry_kind == "none":
         return "AOIs need the geometry of the scene, which was not given."
-    return "No AOIs were given. Name a file of AOIs with --aois FILE.json."
+    return "No AOIs were given. Name a file of AOIs."
 
 
 OBJECTS = Section("objects", "Areas of interest", _show_objects, _explain_absent_objects)
@@ -422,7 +422,7 @@ def _is_finite(value: Any) -> bool:
 def _explain_absent_scores(run: Run) -> str | None:
     if run.results:
         return None
-    return "No evaluation was given. Name the output folder of nerg eval gaze, or give gaze samples and --evaluate."
+    return "No evaluation was given. Name the output folder of nerg eval gaze, or give gaze samples to evaluate."
 
 
 SCORES = Section("scores", "Evaluation", _show_scores, _explain_absent_scores)
@@ -625,11 +625,7 @@ def _explain_absent_verdict(run: Run) -> str | None:
     if run.results:
         return None
     held_out = "test" in run.provenance
-    remedy = (
-        "Score the field with nerg eval gaze"
-        if held_out
-        else "Train with --test-zones and --test-participants to hold out test data"
-    )
+    remedy = "Score the field with nerg eval gaze" if held_out else "Hold out zones and participants in the training"
     return (
         f"No evaluation was given, so this report does not state how well the field predicts held-out data. {remedy}."
     )

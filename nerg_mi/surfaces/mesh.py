@@ -10,7 +10,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from nerg_mi.errors import NergError, import_extra
+from nerg_mi.errors import NergError, import_extra, parameter
 from nerg_mi.maths.arrays import copy_aligned, to_vector
 from nerg_mi.maths.coordinates import check_coordinates
 from nerg_mi.maths.types import variant_types
@@ -187,7 +187,7 @@ def refine(mesh: Mesh, max_edge: float) -> RefinedMesh:
         if len(faces) + np.count_nonzero(midpoint >= 0) > MAX_REFINED_FACES:
             raise NergError(
                 f"edges of at most {max_edge:.3g} scene units make more than {MAX_REFINED_FACES:,} faces; use a "
-                "larger --max-edge"
+                f"larger {parameter('max_edge')}"
             )
         vertices = np.concatenate([vertices, 0.5 * (ends[is_long, 0] + ends[is_long, 1])])
         faces, parent, barycentric = _split_faces(vertices, faces, midpoint, parent, barycentric)
@@ -380,8 +380,8 @@ def unwrap_uv(mesh: Mesh, pixels: int) -> Charts:
     xatlas = import_xatlas()
     if len(mesh.faces) > MAX_CHART_FACES:
         raise NergError(
-            f"the mesh has {len(mesh.faces):,} triangles, but a texture supports at most {MAX_CHART_FACES:,}; "
-            "omit --texture-size to write vertex colours"
+            f"the mesh has {len(mesh.faces):,} triangles, but a texture supports at most {MAX_CHART_FACES:,}; omit "
+            f"{parameter('texture_size')} to write vertex colours"
         )
     # Normalise to avoid underflow in single precision.
     unit = (mesh.vertices - mesh.vertices.mean(axis=0)) / (mesh.diagonal or 1.0)
@@ -397,7 +397,9 @@ def unwrap_uv(mesh: Mesh, pixels: int) -> Charts:
             break
         texels *= 0.85
     else:
-        raise NergError(f"the surface does not fit on {pixels} x {pixels} pixels; use a larger --texture-size")
+        raise NergError(
+            f"the surface does not fit on {pixels} x {pixels} pixels; use a larger {parameter('texture_size')}"
+        )
     vertex, faces, uv = atlas[0]
     # xatlas normalises by the size of its atlas, which may be smaller than the square.
     size = np.array([atlas.width, atlas.height], np.float64)
@@ -449,4 +451,6 @@ def iter_texture_rows(
         batch = slice(start - first, stop - first)
         yield rows, out[batch], hit[batch]
     if is_empty:
-        raise NergError(f"no pixel of a texture of {pixels} x {pixels} shows the surface; give a larger --texture-size")
+        raise NergError(
+            f"no pixel of a texture of {pixels} x {pixels} shows the surface; give a larger {parameter('texture_size')}"
+        )

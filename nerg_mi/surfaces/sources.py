@@ -11,7 +11,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.maths.arrays import to_vector
 from nerg_mi.maths.types import Float, Point3f, Vector3f, variant_types
 from nerg_mi.maths.vmf import tangent_frame
@@ -152,9 +152,8 @@ def subdivide_faces(mesh: Mesh, observer: np.ndarray, max_angle: float, faces: s
             break
         if sum(map(len, finished)) + 4 * np.count_nonzero(~is_small) > MAX_PIECES:
             raise NergError(
-                f"the observer at {','.join(f'{v:g}' for v in observer)} needs more than "
-                f"{MAX_PIECES:,} surface pieces of "
-                f"{np.degrees(max_angle):g} degrees; use a larger --max-angle"
+                f"the observer at {','.join(f'{v:g}' for v in observer)} needs more than {MAX_PIECES:,} surface "
+                f"pieces of {np.degrees(max_angle):g} degrees; use a larger {parameter('max_angle')}"
             )
         pending = pending.select(~is_small).subdivide()
     joined = (

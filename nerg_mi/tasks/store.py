@@ -19,7 +19,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.files.atomic import (
     check_folder,
     create_folder_atomically,
@@ -385,7 +385,9 @@ def read_status(store: Store, age: float = LEFTOVER_AGE) -> StoreStatus:
     """
     plans = store.read_plans()
     if not plans and not any(store.folder.glob("[0-9a-f][0-9a-f]")):
-        raise NergError(f'"{store.folder}" contains no parts of jobs; specify the folder that was passed as --store')
+        raise NergError(
+            f'"{store.folder}" contains no parts of jobs; specify the folder that was passed as {parameter("store")}'
+        )
     manifests = {receipt.key: receipt for receipt in store.iter_manifests()}
     checksums = Checksums()
     jobs, required = [], set[str]()

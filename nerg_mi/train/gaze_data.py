@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from nerg_mi.environment.environment import DEFAULT_DEPTH, Environment
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.fields.gaze_base import GazeHeadConfig, RaySupport, add_prior_floor, make_prior_table, table_directions
 from nerg_mi.fields.kde import SphericalKde
 from nerg_mi.maths.arrays import to_vector
@@ -212,7 +212,7 @@ def compute_semantic_features(
     mi = variant_types()
     medium = geometry.medium
     if not isinstance(medium, FieldMedium):
-        raise NergError("semantic features need a radiance field; pass one with --field")
+        raise NergError(f"semantic features need a radiance field; pass one with {parameter('field')}")
     out = np.empty((len(origins), medium.feature_count), np.float16)
     with dr.suspend_grad():
         for a in range(0, len(out), FEATURE_BATCH):
@@ -426,8 +426,9 @@ def split_views(
     train = select_far_views(views, centres[validation], distance)
     if len(train) < max(2, len(views) // 4):
         raise NergError(
-            f"only {len(train)} of {len(views)} views remain for training; the others are validation views or within "
-            f"{distance:g} of one; use fewer --validation-zones (0: no validation) or a smaller --radius"
+            f"only {len(train)} of {len(views)} views remain for training; the others are validation views or "
+            f"within {distance:g} of one; use fewer {parameter('validation_zones')} (0: no validation) or a "
+            f"smaller {parameter('radius')}"
         )
     return train, [views[k] for k in validation]
 
@@ -699,7 +700,7 @@ class TargetArrays:
     def __init__(self, targets: GazeTargets, ns: ModuleType):
         self.ns, self.num_observers, self.num_directions = ns, *targets.truth.shape
         if self.num_observers == 0:
-            raise NergError("there are no probes to train on; use more rays or a larger --radius")
+            raise NergError(f"there are no probes to train on; use more rays or a larger {parameter('radius')}")
         flat = lambda v: ns.Float(np.ascontiguousarray(v, np.float32).ravel())
         self._solid_angle = None if targets.solid_angle is None else np.asarray(targets.solid_angle, np.float32)
         self._positions, self._r_o = flat(targets.positions), flat(targets.directions)
@@ -784,8 +785,8 @@ def make_targets_from_probes(
     truth = probes.density(rotated)
     if not truth.any():
         raise NergError(
-            f"{directions:,} directions do not resolve the kernels of the rays; use a smaller --kappa or more "
-            "--directions"
+            f"{directions:,} directions do not resolve the kernels of the rays; use a smaller {parameter('kappa')} "
+            f"or more {parameter('directions')}"
         )
     return make_observer_targets(
         geometry.points_to_field(probes.positions),

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from nerg_mi.environment.environment import Environment
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.fields.gaze_base import AnyGazeField, GazeEnsemble, GazeHead, summarize_provenance
 from nerg_mi.files.schema import check_json
 from nerg_mi.formats.checkpoint import read_checkpoint
@@ -56,8 +56,8 @@ def assign_blocks(rays: Rays) -> tuple[np.ndarray, str]:
     _, block = np.unique(np.stack([block, stretch]), axis=1, return_inverse=True)
     if block.max() + 1 < MIN_BLOCKS:
         raise NergError(
-            f"{block.max() + 1} blocks of {BLOCK_SECONDS:g} s of {len(persons)} participants are too few to resample; "
-            "record more data or leave out --ensemble"
+            f"{block.max() + 1} blocks of {BLOCK_SECONDS:g} s of {len(persons)} participants are too few to "
+            f"resample; record more data or leave out {parameter('ensemble')}"
         )
     return block.ravel(), f"blocks of {BLOCK_SECONDS:g} s"
 
@@ -83,7 +83,8 @@ def resample_views(views: tuple[SalienceView, ...], seed: int | tuple[int, int])
     """Draw ``len(views)`` views with replacement. Raises `NergError` for fewer than five views."""
     if len(views) < MIN_BLOCKS:
         raise NergError(
-            f"{len(views)} salience images are too few to resample; use at least {MIN_BLOCKS} or leave out --ensemble"
+            f"{len(views)} salience images are too few to resample; use at least {MIN_BLOCKS} or leave out "
+            f"{parameter('ensemble')}"
         )
     return tuple(views[k] for k in np.random.default_rng(seed).integers(0, len(views), len(views)))
 
@@ -137,7 +138,10 @@ def train_ensemble(
     parts = [path and path.with_name(f"{path.stem}.member{k}.safetensors") for k in range(members)]
     is_file = lambda file: file is not None and file.is_file()
     if state.resume and not any(map(is_file, (path, *parts))):
-        raise NergError(f'cannot resume: the state file "{path}" does not exist; leave out --resume to start a new run')
+        raise NergError(
+            f'cannot resume: the state file "{path}" does not exist; leave out {parameter("resume", True)} to '
+            "start a new run"
+        )
     on_progress = on_progress or (lambda progress: None)
     progress, fold_cost = StagedProgress(on_progress), compute_fold_cost(plan)
     report = progress.start(fold_cost, members)
@@ -169,7 +173,11 @@ def train_ensemble(
                 write=None if part is None else _make_writer(part, identity),
             )
             if provenance["interrupted"]:
-                hint = "no state was saved" if path is None else f"resume with --resume (state in {path})"
+                hint = (
+                    "no state was saved"
+                    if path is None
+                    else f"resume with {parameter('resume', True)} (state in {path})"
+                )
                 raise KeyboardInterrupt(f"interrupted while training member {k + 1} of {members}; {hint}")
         fields.append(field)
         provenances.append(provenance)
@@ -210,8 +218,8 @@ def _get_resampling_kind(members: int, supervision: Supervision, plan: GazePlan)
         return VIEWS
     if plan.probes.kappa_rule == "loo":
         raise NergError(
-            'the kappa rule "loo" cannot be used with --ensemble, because resampled participants would predict '
-            'themselves; choose "fixed" or "silverman"'
+            f'the kappa rule "loo" cannot be used with {parameter("ensemble")}, because resampled participants '
+            'would predict themselves; choose "fixed" or "silverman"'
         )
     _, kind = assign_blocks(supervision.rays)
     return f"{kind} and {VIEWS}" if supervision.views else kind

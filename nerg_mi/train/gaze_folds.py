@@ -12,7 +12,7 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.environment.environment import Environment
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.fields.gaze_base import GazeHead, GazeHeadConfig, interpolate_table
 from nerg_mi.fields.gaze_hits import MAX_HITS, NearestOrigins, ReaimedHits, place_missing_points
 from nerg_mi.interruption import Interruption
@@ -492,7 +492,9 @@ def _restore_selection(
     try:
         return plan, PriorSelection.from_dict(identity[SELECTION_KEY])
     except (TypeError, ValueError) as error:
-        raise NergError(f"the saved selection of the run is damaged ({error}); start again without --resume") from error
+        raise NergError(
+            f"the saved selection of the run is damaged ({error}); start again without {parameter('resume', True)}"
+        ) from error
 
 
 def _select_best(

@@ -302,6 +302,6 @@ register_recipe(
             "weights": "person",
         },
         views_only_settings={"steps": 200, "zones": 3, "patience": 10},
-        supported_options=frozenset({"prior-folds", "prior-kappa", "reaimed-hits"}),
+        supported_options=frozenset({"prior_folds", "prior_kappa", "reaimed_hits"}),
     )
 )

@@ -11,7 +11,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.fields.encoding import HashGrid, HashGridConfig, encode_direction
 from nerg_mi.fields.gaze_product import GazeConfig, GazeField, activate
 from nerg_mi.fields.mlp import MLP
@@ -172,7 +172,8 @@ def extract_initial_weights(field: RadianceField, config: GazeConfig) -> dict:
     like = match_trunk_config(config, field.config)
     if (config.grid, config.position_sizes) != (like.grid, like.position_sizes):
         raise NergError(
-            "a gaze field initialised from a radiance field must have its grid and network sizes; leave out --size"
+            "a gaze field initialised from a radiance field must have its grid and network sizes; leave out "
+            f"{parameter('size')}"
         )
     weights = [dr.detach(w) for w in field.density_net.weights]
     # Drop the first output, which is the log density.
@@ -238,7 +239,7 @@ def _make_product_config(size: str, activation: str) -> Callable[[FieldOptions],
     return config
 
 
-_PRODUCT_OPTIONS = frozenset({"activation", "size", "normalize", "semantic", "init", "loss", "integral-weight"})
+_PRODUCT_OPTIONS = frozenset({"activation", "size", "normalize", "semantic", "init", "loss", "integral_weight"})
 
 register_recipe(
     Recipe(

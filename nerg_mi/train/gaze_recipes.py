@@ -13,14 +13,12 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from nerg_mi.environment.environment import Environment
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.fields.gaze_base import GazeHeadConfig, kinds
 
 from .gaze_settings import GazeSettings, ProbeSettings
 from .gaze_trainer import GazePlan, GazeTrainer
 
-# Command-line options of supported options with another name.
-_SPELLING = {"init": "--init field"}
 DEFAULT_RECIPE = "default"  # Recipe that is used if none is named
 
 
@@ -57,7 +55,7 @@ class Recipe:
     # Changes of ``settings`` for training on views only, whose common structure is learned late, after a plateau.
     views_only_settings: Mapping[str, Any] = field(default_factory=lambda: {"patience": 10})
     # Options that the recipe supports, among "activation", "size", "normalize", "semantic", "init", "loss",
-    # "integral-weight", "prior-folds", "prior-kappa", "reaimed-hits".
+    # "integral_weight", "prior_folds", "prior_kappa", "reaimed_hits".
     supported_options: frozenset[str] = frozenset()
 
     def make_plan(
@@ -94,9 +92,9 @@ class Recipe:
         options = replace(options or FieldOptions(), geometry_kind=geometry.kind)
         (config, *alternatives), initial = self.list_architectures(options), None
         if init_from_field or options.semantic:
-            option = "--init field" if init_from_field else "--semantic"
+            option = parameter("init", "field") if init_from_field else parameter("semantic")
             if geometry.radiance is None:
-                raise NergError(f"{option} needs a radiance field; pass one with --field")
+                raise NergError(f"{option} needs a radiance field; pass one with {parameter('field')}")
             if ("init" if init_from_field else "semantic") not in self.supported_options:
                 raise NergError(f"the recipe {self.name} does not support {option}; leave it out")
             if init_from_field:
@@ -138,10 +136,10 @@ class Recipe:
         unsupported = [name for name in names if name not in self.supported_options]
         if not unsupported:
             return
-        spelling = ", ".join(_SPELLING.get(name, f"--{name}") for name in unsupported)
+        spelling = ", ".join(parameter(n, "field" if n == "init" else "") for n in unsupported)
         alternatives = [r.name for r in load_recipes().values() if r.supported_options.issuperset(names)]
         remedy = (
-            f"add --recipe {alternatives[0]}"
+            f"add {parameter('recipe', alternatives[0])}"
             if alternatives
             else f"leave {'it' if len(unsupported) == 1 else 'them'} out"
         )

@@ -15,7 +15,7 @@ import numpy as np
 from drjit.opt import AdamW
 
 from nerg_mi.environment.environment import Environment
-from nerg_mi.errors import NergError, sanitize
+from nerg_mi.errors import NergError, parameter, sanitize
 from nerg_mi.fields.gaze_base import GazeHead, GazeHeadConfig
 from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.files.schema import INDEX, Items, check_json
@@ -236,13 +236,14 @@ class GazeTrainer(Trainer, ABC):
     def init_from_radiance(cls, radiance: RadianceField, config: Any) -> tuple[Any, dict]:
         """Return ``config`` with the sizes of a radiance field, and the arrays of the field to start from."""
         raise NergError(
-            f"a {config.kind} gaze field cannot be initialised from a radiance field; leave out --init field"
+            f"a {config.kind} gaze field cannot be initialised from a radiance field; leave out "
+            f"{parameter('init', 'field')}"
         )
 
     @classmethod
     def configure_features(cls, radiance: RadianceField, config: Any) -> Any:
         """Return ``config`` with the number of semantic features of ``radiance``."""
-        raise NergError(f"a {config.kind} gaze field has no semantic features; leave out --semantic")
+        raise NergError(f"a {config.kind} gaze field has no semantic features; leave out {parameter('semantic')}")
 
     def complete_config(self, config: Any, targets: GazeTargets) -> Any:
         """Return ``config`` with the values that depend on the ``targets``."""
@@ -379,7 +380,10 @@ def read_run_identity(state: StateSettings) -> dict | None:
 
 def _require_state_file(path: Path | None) -> Path:
     if path is None or not path.is_file():
-        raise NergError(f'cannot resume: the state file "{path}" does not exist; leave out --resume to start a new run')
+        raise NergError(
+            f'cannot resume: the state file "{path}" does not exist; leave out {parameter("resume", True)} to '
+            "start a new run"
+        )
     return path
 
 

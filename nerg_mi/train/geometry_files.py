@@ -12,7 +12,7 @@ import numpy as np
 from nerg_mi.alignment.check import check_alignment
 from nerg_mi.environment import environment as geometry
 from nerg_mi.environment.environment import Environment
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.formats.fields import matches_checksum
 from nerg_mi.maths.geometry import AnyBox, Similarity
 from nerg_mi.options import GeometryOptions
@@ -29,13 +29,13 @@ def geometry_kind(options: GeometryOptions) -> str:
     """Return the kind of geometry that is selected. Raises `NergError` unless it is exactly one."""
     if sum(v is not None for v in (options.field, options.scene, options.geometry)) != 1:
         raise NergError(
-            "give the geometry that the participants saw: one of --field FILE, --scene FILE, --geometry hits, "
-            "--geometry none"
+            f"give the geometry that the participants saw: one of {parameter('field', 'FILE')}, "
+            f"{parameter('scene', 'FILE')}, {parameter('geometry', 'hits')}, {parameter('geometry', 'none')}"
         )
     if options.geometry not in (None, "hits", "none"):
         raise NergError(
-            f'--geometry must be "hits" or "none", got "{options.geometry}"; the file of a mesh or scene is given with '
-            "--scene, that of a radiance field with --field"
+            f'{parameter("geometry")} must be "hits" or "none", got "{options.geometry}"; the file of a mesh or '
+            f"scene is given with {parameter('scene')}, that of a radiance field with {parameter('field')}"
         )
     return options.geometry or ("field" if options.field is not None else "scene")
 
@@ -87,7 +87,8 @@ def make_geometry(
         return geometry.no_geometry(np.concatenate(origins))
     if rays is None or volume is None:
         raise NergError(
-            "a geometry of hit points needs rays, and is written next to the gaze field: give both, or use --field"
+            "a geometry of hit points needs rays, and is written next to the gaze field: give both, or use "
+            f"{parameter('field')}"
         )
     environment = geometry.make_hit_geometry(rays, volume, voxel)
     made = environment.metadata["geometry_file"]
@@ -126,9 +127,13 @@ def load_training_geometry(
     if provenance.get("geometry") == "none":
         return Environment(None, box, "none", align=align)
     makers: dict[str, tuple[Path | None, str, Callable[[Path], Environment]]] = {
-        "field_file": (field, "--field", lambda path: geometry.load_field_geometry(path, ns)),
-        "scene_file": (scene, "--scene", geometry.load_scene_geometry),
-        "geometry_file": (None if choice is None else Path(choice), "--geometry", geometry.load_volume_geometry),
+        "field_file": (field, parameter("field"), lambda path: geometry.load_field_geometry(path, ns)),
+        "scene_file": (scene, parameter("scene"), geometry.load_scene_geometry),
+        "geometry_file": (
+            None if choice is None else Path(choice),
+            parameter("geometry"),
+            geometry.load_volume_geometry,
+        ),
     }
     key = geometry_key(gaze, provenance)
     explicit, name, make = makers[key]
@@ -138,13 +143,17 @@ def load_training_geometry(
 
 def _check_trained_kind(gaze: Path, provenance: dict, kind: str) -> None:
     """Raise `NergError` unless ``gaze`` was trained with ``--geometry kind``."""
-    trained_options = {"field_file": "--field", "scene_file": "--scene", "geometry_file": "--geometry hits"}
+    trained_options = {
+        "field_file": parameter("field"),
+        "scene_file": parameter("scene"),
+        "geometry_file": parameter("geometry", "hits"),
+    }
     is_without = provenance.get("geometry") == "none"
-    trained = "--geometry none" if is_without else trained_options[geometry_key(gaze, provenance)]
-    if trained != f"--geometry {kind}":
+    trained = parameter("geometry", "none") if is_without else trained_options[geometry_key(gaze, provenance)]
+    if trained != parameter("geometry", kind):
         raise NergError(
-            f'--geometry is "{kind}", but "{gaze}" was trained with {trained}, and is evaluated in the geometry of its '
-            "training; leave out --geometry"
+            f'{parameter("geometry")} is "{kind}", but "{gaze}" was trained with {trained}, and is evaluated in '
+            f"the geometry of its training; leave out {parameter('geometry')}"
         )
 
 
@@ -194,8 +203,8 @@ def check_geometry(
     remedy = f"find the alignment with: nerg align RAYS {options} -o alignment.json, and use it with --align"
     if check.is_impossible and not force:
         raise NergError(
-            f"{100 * check.escaped:.1f} % of the gaze hits no surface, so the rays are not aligned with the "
-            f"scene; {remedy} (or add --force to continue anyway)"
+            f"{100 * check.escaped:.1f} % of the gaze hits no surface, so the rays are not aligned with the scene; "
+            f"{remedy} (or add {parameter('force', True)} to continue anyway)"
         )
     doubts = check.list_warnings()
     if doubts:

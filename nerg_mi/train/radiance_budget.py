@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
+from nerg_mi.errors import parameter
 from nerg_mi.photos.images import PhotoView
 
 from .radiance_trainer import RadianceTrainer
@@ -71,8 +72,8 @@ class Budget:
             return None
         self._is_warned = True
         return (
-            f"the occupancy and the scores of the result take about {needed:.0f} s, so that the run will take about "
-            f"{(self._limit + needed - reserved) / 60:.2g} minutes: give it more --minutes"
+            f"the occupancy and the scores of the result take about {needed:.0f} s, so that the run will take "
+            f"about {(self._limit + needed - reserved) / 60:.2g} minutes: give it more {parameter('minutes')}"
         )
 
     @property

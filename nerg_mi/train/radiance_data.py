@@ -8,7 +8,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.maths.types import Array3f, Float, UInt32
 from nerg_mi.photos.cameras import Intrinsics, find_fisheye_limit, project
 from nerg_mi.photos.dataset import MAX_CONVERGENCE_ANGLE, find_focus
@@ -144,7 +144,9 @@ class PixelBank:
         used = [n if v.mask is None else int(np.count_nonzero(v.mask)) for n, v in zip(counts, views)]
         self.size = sum(used)
         if sum(counts) >= _MAX_PIXELS:
-            raise NergError(f"{sum(counts)} training pixels are too many; use a smaller --width or fewer photos")
+            raise NergError(
+                f"{sum(counts)} training pixels are too many; use a smaller {parameter('width')} or fewer photos"
+            )
         self.centers = np.array([v.camera.center for v in views])
         self._ends = ns.UInt32(np.cumsum(counts).astype(np.uint32))
         self._starts = ns.UInt32(np.cumsum([0, *counts[:-1]]).astype(np.uint32))

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from nerg_mi.errors import parameter
 from nerg_mi.photos.images import PhotoView
 from nerg_mi.photos.posed import format_names
 
@@ -71,7 +72,11 @@ def find_problems(outcome: Outcome, causes: list[str]) -> list[str]:
     ``causes`` are likely causes of a poor result, from `find_causes`.
     """
     out, steps, history = [], outcome.steps, outcome.history
-    remedy = "more --steps" if outcome.minutes is None else "more --minutes, or --steps"
+    remedy = (
+        f"more {parameter('steps')}"
+        if outcome.minutes is None
+        else f"more {parameter('minutes')}, or {parameter('steps')}"
+    )
     if steps < MIN_STEPS:
         timed = outcome.minutes is not None and outcome.seconds > 0
         rate = f" ({describe_pace(steps / outcome.seconds, outcome.waiting_fraction)})" if timed else ""
@@ -87,8 +92,9 @@ def find_problems(outcome: Outcome, causes: list[str]) -> list[str]:
     best, last = outcome.result, history[-1]["psnr"]
     if best["psnr"] - last > _MAX_DROP:
         out.append(
-            f"held-out views were best at step {best['steps']} with {best['psnr']:.2f} dB, and had {last:.2f} dB at "
-            "the end: the field of that step is the result, and more --minutes would not improve it"
+            f"held-out views were best at step {best['steps']} with {best['psnr']:.2f} dB, and had {last:.2f} dB "
+            f"at the end: the field of that step is the result, and more {parameter('minutes')} would not improve "
+            "it"
         )
     if outcome.is_poor:
         training = f", training views {outcome.gap:.1f} dB more" if outcome.gap > 0 else ""
@@ -158,7 +164,10 @@ def find_causes(views: list[PhotoView], exposure_stops: float = 0.0, outside_fra
     if exposure_stops > _MAX_STOPS:
         out.append(f"exposures differ by {exposure_stops:.1f} stops: lock the exposure of the camera")
     if outside_fraction > _MAX_OUTSIDE:
-        out.append(f"{outside_fraction:.0%} of the pixels show what is beyond the bounding box: enlarge it with --aabb")
+        out.append(
+            f"{outside_fraction:.0%} of the pixels show what is beyond the bounding box: enlarge it with "
+            f"{parameter('aabb')}"
+        )
     blurred = [v.name for v, s in zip(views, sharpness) if s < _MIN_SHARPNESS * np.median(sharpness)]
     if len(blurred) > _MAX_BLURRED * len(views):
         out.append(f"{len(blurred)} photos are blurred: remove {format_names(blurred, 3)}")

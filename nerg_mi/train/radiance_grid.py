@@ -8,7 +8,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid, cascades_from_contracted, cell_corner, dilate
 from nerg_mi.maths.arrays import copy_aligned
 from nerg_mi.maths.geometry import AnyBox
@@ -77,8 +77,8 @@ class DensityGrid:
         self._restrict_to(self._find_seen_cells(free_space))
         if self.seen_count == 0:
             raise NergError(
-                f"no cell of the scene box {box.lower} to {box.upper} is seen by {min_views} cameras; "
-                "pass a box around the photographed scene with --aabb"
+                f"no cell of the scene box {box.lower} to {box.upper} is seen by {min_views} cameras; pass a box "
+                f"around the photographed scene with {parameter('aabb')}"
             )
         self.always = dr.full(ns.Bool, False, cells)
         self.turn = 0

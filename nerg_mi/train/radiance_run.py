@@ -14,7 +14,7 @@ from types import ModuleType
 import drjit as dr
 import numpy as np
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, clean_text, parameter
 from nerg_mi.fields.radiance import EMPTY, RadianceConfig, RadianceField
 from nerg_mi.files.schema import INDEX, NUMBER, Items, Number, check_json
 from nerg_mi.formats.checkpoint import read_checkpoint, write_checkpoint
@@ -396,7 +396,8 @@ class Pace:
             return None
         return (
             f"at this pace ({describe_pace(per_second, self.waiting_fraction)}) the training will have about "
-            f"{expected:.0f} steps, but a usable field needs at least {MIN_STEPS}: give it more --minutes"
+            f"{expected:.0f} steps, but a usable field needs at least {MIN_STEPS}: give it more "
+            f"{parameter('minutes')}"
         )
 
 
@@ -488,7 +489,8 @@ def _make_result(
     causes = []
     if outcome.is_poor:
         causes = find_causes(dataset.train, provenance.get("photo_stops", 0.0), provenance.get("beyond_box", 0.0))
-    provenance["complaints"] = [*([f"the field {EMPTY}"] if field.is_empty else []), *find_problems(outcome, causes)]
+    problems = [*([f"the field {EMPTY}"] if field.is_empty else []), *find_problems(outcome, causes)]
+    provenance["complaints"] = [clean_text(problem) for problem in problems]
     return field, provenance
 
 

@@ -12,7 +12,7 @@ import drjit as dr
 import numpy as np
 from drjit.opt import Adam
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.fields.occupancy import refine_occupancy
 from nerg_mi.fields.radiance import RadianceConfig, RadianceField, mean_features
 from nerg_mi.formats.fields import read_number
@@ -201,7 +201,7 @@ class RadianceTrainer(Trainer):
         depth: bool = True,
     ):
         if not views:
-            raise NergError("there are no photos to train on; hold out fewer with --holdout")
+            raise NergError(f"there are no photos to train on; hold out fewer with {parameter('holdout')}")
         super().__init__(settings, ns)
         self.config, self.box, self.clock = config, box, StepClock()
         self.pixels = PixelBank(ns, views)

@@ -13,10 +13,11 @@ from typing import Any, ClassVar
 import drjit as dr
 import numpy as np
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.files.safe_read import translate_read_errors
 from nerg_mi.files.schema import Items, Number, check_json
 from nerg_mi.formats.fields import read_number
+from nerg_mi.interruption import Interrupted
 
 # ---- Trainer ----
 
@@ -137,7 +138,7 @@ _COUNTS = {"rays": (0, 2**60), "samples": (0, 2**60), "looked": (0, 2**60), "str
 def reading_run_state(path: str | Path) -> Iterator[None]:
     """Convert errors caused by a damaged run state in the block to a `NergError` that names ``path``."""
     with translate_read_errors(
-        path, "run state", "start again without --resume", extra_errors=(TypeError, AttributeError)
+        path, "run state", f"start again without {parameter('resume', True)}", extra_errors=(TypeError, AttributeError)
     ):
         yield
 
@@ -185,10 +186,12 @@ def saving_on_failure(path: Path | None, save: Callable[[], None], is_done: bool
             # Probably the same full disk: an older state remains, and the first error is the one to report.
             raise error from None
         if isinstance(error, NergError):
-            reason = str(error).rstrip(".")
-            raise NergError(f"{reason}; the training is saved: fix this and write it with --resume") from error
+            reason = error.message.rstrip(".")
+            raise NergError(
+                f"{reason}; the training is saved: fix this and write it with {parameter('resume', True)}"
+            ) from error
         if isinstance(error, KeyboardInterrupt):
-            raise KeyboardInterrupt(f"interrupted; resume with --resume (state in {path})") from error
+            raise Interrupted(f"interrupted; resume with {parameter('resume', True)} (state in {path})") from error
         raise
     if path is not None and is_done:
         path.unlink(missing_ok=True)
@@ -229,13 +232,15 @@ def _use_current_names(identity: dict) -> dict:
 def check_same_run(path: str | Path, then: dict, now: dict) -> None:
     """Raise `NergError` unless the identities ``then`` of the stored run and ``now`` of this run agree."""
     if not isinstance(then, dict):
-        raise NergError(f'cannot resume the run in "{path}": its state is damaged; start again without --resume')
+        raise NergError(
+            f'cannot resume the run in "{path}": its state is damaged; start again without {parameter("resume", True)}'
+        )
     then, now = _use_current_names(then), json.loads(json.dumps(now))
     different = [k for k in now if then.get(k) != now[k]]
     if different:
         raise NergError(
-            f'cannot resume the run in "{path}": it was started with different {", ".join(different)}; use the same '
-            "options and data, or start again without --resume"
+            f'cannot resume the run in "{path}": it was started with different {", ".join(different)}; use the '
+            f"same options and data, or start again without {parameter('resume', True)}"
         )
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 
 import drjit as dr
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 
 from .field_medium import evaluate_features
 from .observer import ObserverView, SupportView
@@ -31,7 +31,8 @@ FIELD = Dependency(lambda nerg: "field" in nerg.children, 'which needs a "field"
 GAZE = Dependency(lambda nerg: nerg.gaze is not None, 'which needs a "gaze" volume')
 KDE = Dependency(lambda nerg: "kde" in nerg.children, 'which needs a "kde" volume of type "gazekde"')
 MEMBERS = Dependency(
-    lambda nerg: len(nerg.gaze.field.members) > 1, 'which needs an ensemble as "gaze"; train one with --ensemble 5'
+    lambda nerg: len(nerg.gaze.field.members) > 1,
+    f'which needs an ensemble as "gaze"; train one with {parameter("ensemble", 5)}',
 )
 SUPPORT = Dependency(
     lambda nerg: nerg.gaze.field.support is not None, 'which needs a "gaze" checkpoint with support; train it again'

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError, format_error
+from nerg_mi.errors import NergError, clean_text, format_error
 from nerg_mi.figures.style import Provenance, make_provenance
 from nerg_mi.files.images import encode_png
 from nerg_mi.formats.areas import MAX_AREAS, Region, format_areas
@@ -39,7 +39,7 @@ def notify(event_or_client: Any, title: str, text: str) -> None:
     """Show a notification in the browser of a client or event."""
     client = getattr(event_or_client, "client", event_or_client)
     if client is not None:
-        client.add_notification(title=title, body=text, with_close_button=True, auto_close_seconds=12.0)
+        client.add_notification(title=title, body=clean_text(text), with_close_button=True, auto_close_seconds=12.0)
 
 
 @contextmanager

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from nerg_mi.errors import NergError, format_error, is_user_error
+from nerg_mi.errors import NergError, clean_text, format_error, is_user_error
 
 from . import layers
 from .points import NUM_LEVELS, PinholeView, StagePicture
@@ -445,7 +445,7 @@ class Page:
 
     def on_error(self, error: BaseException) -> None:
         """Show an error in the status text, with its type if it is a bug."""
-        text = format_error(error)
+        text = clean_text(format_error(error))
         self.problem = text if is_user_error(error) else f"{type(error).__name__}: {text} (a bug in nerg_mi)"
 
     # Browsers

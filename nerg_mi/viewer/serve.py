@@ -180,7 +180,7 @@ def view(inputs: object, *, options: ViewOptions | None = None, progress: Progre
     ...     viewer.address.startswith("http://127.0.0.1:")
     True
     """
-    with report_progress(progress, ViewOptions) as reporter:
+    with report_progress(progress) as reporter:
         resolved = build_options(ViewOptions, "view", options, overrides)
         paths = [as_file(item, "inputs") for item in list_inputs(inputs)]
         return Viewer(open_viewer(paths, resolved, reporter, is_embeddable=True))

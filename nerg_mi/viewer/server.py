@@ -17,7 +17,7 @@ from http.cookies import CookieError, SimpleCookie
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-from nerg_mi.errors import NergError, format_error
+from nerg_mi.errors import NergError, format_error, parameter
 
 # ---- Access control ----
 #
@@ -321,5 +321,6 @@ def _check_port(host: str, port: int) -> None:
             probe.bind((host, port))
         except (OSError, OverflowError) as error:
             raise NergError(
-                f"port {port} of {host} cannot be used ({format_error(error).rstrip('.')}); choose another with --port"
+                f"port {port} of {host} cannot be used ({format_error(error).rstrip('.')}); choose another with "
+                f"{parameter('port')}"
             ) from error

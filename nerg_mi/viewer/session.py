@@ -14,7 +14,7 @@ import numpy as np
 
 from nerg_mi.api.query import compute_shares, make_shape_aois, trace
 from nerg_mi.api.scene import COLOR, Scene
-from nerg_mi.errors import NergError, translate_mitsuba_errors
+from nerg_mi.errors import NergError, parameter, translate_mitsuba_errors
 from nerg_mi.files.atomic import write_text
 from nerg_mi.formats.areas import AreaSet, Region, read_areas
 from nerg_mi.maths.geometry import Similarity
@@ -525,7 +525,7 @@ class Session:
             )
         self.home_view = PinholeView.from_sensor(sensors[0])
         self.spp = min(self.options.spp or int(sensors[0].sampler().sample_count()), _MAX_SPP)
-        observer = check_point(self.options.observer, "--observer")
+        observer = check_point(self.options.observer, parameter("observer"))
         scene_observer = self.scene.observer
         if observer is None:
             observer = self._default_observer() if scene_observer is None else np.asarray(scene_observer, float)

@@ -15,7 +15,7 @@ from nerg_mi.alignment.similarity import transform_points
 from nerg_mi.alignment.tracking import Tracking, compare_flips
 from nerg_mi.environment import environment as geometry
 from nerg_mi.environment.environment import Environment
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.figures.maps import alignment_figure
 from nerg_mi.figures.style import make_provenance, save
 from nerg_mi.files.atomic import check_writable, file_sha256
@@ -87,7 +87,7 @@ def align(
     _report_notes(fit, reporter)
     rejection = _rejection_reason(fit, options)
     if rejection and not options.force:
-        raise NergError(f"{rejection}; or add --force to write it anyway")
+        raise NergError(f"{rejection}; or add {parameter('force', True)} to write it anyway")
     files = {name: _identity(path) for name, path in _sources(rays, options).items()}
     result = Alignment.from_fit(evidence.kind, fit, files, bool(rejection))
     _report_alignment(result, reporter)
@@ -103,26 +103,29 @@ def align(
         save(_figure(fit, target, heads, result), picture, header)
         result.save(output)
         written = [output, picture]
-        reporter.message(f"wrote {output} (check {picture.name}); use it with --align {output}")
+        reporter.message(f"wrote {output} (check {picture.name}); use it with {parameter('align', output)}")
     return AlignResult(result, written)
 
 
 def _evidence(options: AlignOptions, rays: Rays | None, reporter: Reporter) -> Evidence:
     """Return the evidence given by ``options``. Raises `NergError` for several kinds, or none."""
     evidence = {
-        "--pairs": options.pairs,
-        "--tracking-surface": options.tracking_surface,
-        "--tracking-cameras": options.tracking_cameras,
-        "--init": options.init,
+        parameter("pairs"): options.pairs,
+        parameter("tracking_surface"): options.tracking_surface,
+        parameter("tracking_cameras"): options.tracking_cameras,
+        parameter("init"): options.init,
     }
     kinds = [flag for flag, path in evidence.items() if path is not None]
     if len(kinds) > 1:
         named = ", ".join(kinds)
-        raise NergError(f"{named} are alternatives: give one of them, and add --refine to refine it with the tracking")
+        raise NergError(
+            f"{named} are alternatives: give one of them, and add {parameter('refine', True)} to refine it with "
+            "the tracking"
+        )
     if (options.tracking_cameras is None) != (options.scene_cameras is None):
-        raise NergError("--tracking-cameras and --scene-cameras must be given together")
+        raise NergError(f"{parameter('tracking_cameras')} and {parameter('scene_cameras')} must be given together")
     if options.refine and rays is None:
-        raise NergError("--refine needs the tracking: give a rays file")
+        raise NergError(f"{parameter('refine', True)} needs the tracking: give a rays file")
     if options.pairs is not None:
         return read_pairs(options.pairs)
     if (path := options.tracking_surface) is not None:
@@ -131,10 +134,11 @@ def _evidence(options: AlignOptions, rays: Rays | None, reporter: Reporter) -> E
         return read_cameras(options.tracking_cameras, _path(options.scene_cameras))
     if rays is None:
         raise NergError(
-            "no evidence is given: name a rays file (tracking alone), or add --pairs FILE, --tracking-surface "
-            "FILE, or --tracking-cameras with --scene-cameras"
+            f"no evidence is given: name a rays file (tracking alone), or add {parameter('pairs', 'FILE')}, "
+            f"{parameter('tracking_surface', 'FILE')}, or {parameter('tracking_cameras')} with "
+            f"{parameter('scene_cameras')}"
         )
-    start = None if options.init is None else read_similarity(options.init, "--init", "rays to scene").matrix
+    start = None if options.init is None else read_similarity(options.init, parameter("init"), "rays to scene").matrix
     return Tracking(rays, start, options.seed)
 
 
@@ -146,15 +150,15 @@ def _path(path: Path | None) -> Path:
 def _target(options: AlignOptions, kind: str, reporter: Reporter) -> tuple[Environment | None, AlignmentTarget]:
     kinds = [n for n in ("field", "scene", "surface") if getattr(options, n) is not None]
     if len(kinds) > 1:
-        raise NergError(f"only one scene can be given: use --{' or --'.join(kinds)}")
+        raise NergError(f"only one scene can be given: use {' or '.join(map(parameter, kinds))}")
     is_upright = (kind == Tracking.kind and options.init is None) or options.turn is not None
     up = "z" if options.up is None and is_upright else options.up
     if up is not None and options.up is None:
-        reporter.message("the scene is assumed to be z up; use --up for another axis")
+        reporter.message(f"the scene is assumed to be z up; use {parameter('up')} for another axis")
     to_z_up = _turn(up)
     scene_floor, shift = options.scene_floor_height, None
     if options.shift is not None:
-        shift = to_z_up[:3, :3] @ parse_point(options.shift, "--shift")
+        shift = to_z_up[:3, :3] @ parse_point(options.shift, parameter("shift"))
         if scene_floor is None and (options.scale is not None or not options.floor_height):
             scene_floor = shift[2] + (options.scale or 1) * options.floor_height
     common = {
@@ -168,7 +172,10 @@ def _target(options: AlignOptions, kind: str, reporter: Reporter) -> tuple[Envir
     }
     if not kinds:
         if kind in (Tracking.kind, Twin.kind) or options.refine:
-            raise NergError("no scene is given: add --field FILE, --scene FILE or --surface FILE (a mesh or points)")
+            raise NergError(
+                f"no scene is given: add {parameter('field', 'FILE')}, {parameter('scene', 'FILE')} or "
+                f"{parameter('surface', 'FILE')} (a mesh or points)"
+            )
         return None, AlignmentTarget(**common)
     if options.surface is not None:
         return None, AlignmentTarget(points=read_surface(options.surface, on_note=reporter.message), **common)
@@ -192,11 +199,12 @@ def _turn(up: str | None) -> np.ndarray:
     turn = np.eye(4)
     if up is None:
         return turn
-    axis = np.array(_AXES.get(up.strip().lower()) or parse_point(up, "--up"), float)
+    axis = np.array(_AXES.get(up.strip().lower()) or parse_point(up, parameter("up")), float)
     length = np.linalg.norm(axis)
     if length == 0:
         raise NergError(
-            f"--up must be an axis (x, y, z, -x, -y, -z) or three numbers x,y,z that are not all 0, got {up!r}"
+            f"{parameter('up')} must be an axis (x, y, z, -x, -y, -z) or three numbers x,y,z that are not all 0, "
+            f"got {up!r}"
         )
     turn[:3, :3] = rotation_to_z(axis / length)
     return turn
@@ -219,22 +227,22 @@ def _rejection_reason(fit: AlignmentFit, options: AlignOptions) -> str:
     """Return why an alignment is rejected, or an empty string."""
     if fit.mirrored is not None:
         return (
-            f"the tracking is mirrored: {fit.mirrored}; import it again with the other --hand, or correct the "
-            "negated axis in the evidence"
+            f"the tracking is mirrored: {fit.mirrored}; import it again with the other {parameter('handedness')}, "
+            "or correct the negated axis in the evidence"
         )
     if fit.interval is not None:
         if reason := fit.interval.rejection_reason():
             return reason
         if fit.metadata["heads_in_solids"] > MAX_IN_SOLIDS:
             return (
-                f"{100 * fit.metadata['heads_in_solids']:.0f} % of the heads are inside solid objects: check --up, "
-                "--scale and --floor-height, or give other evidence"
+                f"{100 * fit.metadata['heads_in_solids']:.0f} % of the heads are inside solid objects: check "
+                f"{parameter('up')}, {parameter('scale')} and {parameter('floor_height')}, or give other evidence"
             )
     median = float(np.median(fit.residuals_cm)) if len(fit.residuals_cm) else 0.0
     if not median <= options.max_residual:
         return (
-            f"the median residual is {median:.3g} cm, above --max-residual {options.max_residual:g}: give other "
-            "evidence, or a larger limit"
+            f"the median residual is {median:.3g} cm, above "
+            f"{parameter('max_residual', f'{options.max_residual:g}')}: give other evidence, or a larger limit"
         )
     return ""
 

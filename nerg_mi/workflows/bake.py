@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.evaluation.metrics import cc
 from nerg_mi.figures.overlay import Heat, overlay
 from nerg_mi.figures.style import Provenance
@@ -190,7 +190,7 @@ def check_texture(paths: list[Path], pixels: int | None) -> None:
     if pixels is None:
         return
     if not any(path.suffix.lower() == ".glb" for path in paths):
-        raise NergError("--texture-size needs a glTF output; add an output whose name ends in .glb")
+        raise NergError(f"{parameter('texture_size')} needs a glTF output; add an output whose name ends in .glb")
     import_xatlas()
 
 
@@ -294,8 +294,8 @@ def bake(
     across = receivers.mesh.diagonal / align.scale
     if across > _LARGEST:
         reporter.warn(
-            f"the surface is {across:,.0f} m across; if its unit is not the metre, give --align with the scale "
-            "from metres to that unit"
+            f"the surface is {across:,.0f} m across; if its unit is not the metre, give {parameter('align')} with "
+            "the scale from metres to that unit"
         )
     refined = refine_target(receivers, options.max_edge, align.scale)
     mesh = refined.mesh
@@ -412,6 +412,9 @@ def _report_summary(summary: dict[str, Any], reporter: Reporter) -> None:
             "divide shares by this value to compare them"
         )
     if abs(summary["unaccounted"]) > _ERROR * summary["total"]:
-        reporter.warn("more than 0.2 % of the gaze is unaccounted for; reduce --max-angle or --max-edge")
+        reporter.warn(
+            f"more than 0.2 % of the gaze is unaccounted for; reduce {parameter('max_angle')} or "
+            f"{parameter('max_edge')}"
+        )
     if "halves_cc" in summary:
         reporter.message(f"agreement between two halves of the participants: CC {summary['halves_cc']:.3f}")

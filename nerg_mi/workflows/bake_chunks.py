@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.alignment.check import read_similarity
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.fields.splats import Splats
 from nerg_mi.figures.style import Provenance, find_colormap, make_provenance
@@ -81,15 +81,23 @@ def select_source(options: BakeOptions, rays: Rays | None, with_gaze: bool = Fal
     people = rays is not None or options.rays is not None
     source = options.source or ("field" if options.gaze is not None or (with_gaze and not people) else "rays")
     if source not in SOURCES:
-        raise NergError(f'--source must be {" or ".join(SOURCES)}, got "{source}"')
+        raise NergError(f'{parameter("source")} must be {" or ".join(SOURCES)}, got "{source}"')
     if options.unit not in UNITS:
-        raise NergError(f'--unit must be {" or ".join(UNITS)}, got "{options.unit}"')
+        raise NergError(f'{parameter("unit")} must be {" or ".join(UNITS)}, got "{options.unit}"')
     if source == "rays" and not people:
-        raise NergError("there is no gaze: give a gaze field with --gaze, or rays with --rays")
+        raise NergError(
+            f"there is no gaze: give a gaze field with {parameter('gaze')}, or rays with {parameter('rays')}"
+        )
     if source == "rays" and (options.observer is not None or options.observer_file is not None):
-        raise NergError("--observer and --observer-file need a gaze field; add --gaze, or leave them out")
+        raise NergError(
+            f"{parameter('observer')} and {parameter('observer_file')} need a gaze field; add {parameter('gaze')}, "
+            "or leave them out"
+        )
     if source == "field" and (options.unit == "seconds" or options.split_half):
-        raise NergError("--unit seconds and --split-half apply to rays, which have durations; add --source rays")
+        raise NergError(
+            f"{parameter('unit', 'seconds')} and {parameter('split_half', True)} apply to rays, which have "
+            f"durations; add {parameter('source', 'rays')}"
+        )
     return source
 
 
@@ -152,7 +160,10 @@ class BakeScene:
         if isinstance(part, TrackedRays):
             return sum_rays(target, part, self.ray_settings)
         if make is None:
-            raise NergError("there is no gaze field: name one by --gaze, or take the gaze of the rays, --source rays")
+            raise NergError(
+                f"there is no gaze field: name one by {parameter('gaze')}, or take the gaze of the rays, "
+                f"{parameter('source', 'rays')}"
+            )
         return sum_gaze(target, make, part.positions, part.weights, self.gaze_settings)
 
     @property
@@ -215,7 +226,7 @@ def load_bake_rays(options: BakeOptions, rays: Rays | None) -> Rays | None:
     if loaded is None and options.rays is not None:
         loaded = load_rays(options.rays, options.max_samples, options.seed)
     if loaded is not None and not len(loaded):
-        raise NergError("the file of --rays contains no rays; name another one")
+        raise NergError(f"the file of {parameter('rays')} contains no rays; name another one")
     return loaded
 
 
@@ -223,20 +234,24 @@ def make_observers(options: BakeOptions, rays: Rays | None, align: Similarity, r
     """Return the observers of a gaze field, in scene coordinates. Raises `NergError` for none or several kinds."""
     kinds = [
         name
-        for name, value in (("--observer", options.observer), ("--observer-file", options.observer_file))
+        for name, value in (
+            (parameter("observer"), options.observer),
+            (parameter("observer_file"), options.observer_file),
+        )
         if value is not None
     ]
     if len(kinds) > 1:
-        raise NergError("--observer and --observer-file are alternatives; give one of them")
+        raise NergError(f"{parameter('observer')} and {parameter('observer_file')} are alternatives; give one of them")
     if options.observer is not None:
         if len(options.observer) != 3:
-            raise NergError(f"--observer must be three numbers x,y,z, got {options.observer}")
+            raise NergError(f"{parameter('observer')} must be three numbers x,y,z, got {options.observer}")
         return WeightedObservers(np.array([options.observer], np.float64), np.ones(1))
     if options.observer_file is not None:
         return read_observer_file(options.observer_file)
     if rays is None:
         raise NergError(
-            "there is no observer: give --observer x,y,z, an --observer-file, or the recorded positions of --rays"
+            f"there is no observer: give {parameter('observer', 'x,y,z')}, an {parameter('observer_file')}, or the "
+            f"recorded positions of {parameter('rays')}"
         )
     observers = cluster_observers(
         transform_points(rays.origin, align),
@@ -284,14 +299,14 @@ def transform_points(points: np.ndarray, align: Similarity) -> np.ndarray:
 def check_values(options: BakeOptions) -> None:
     """Raise `NergError` for an unknown weighting or colour map."""
     if options.ray_weights not in WEIGHTINGS:
-        raise NergError(f'--ray-weights must be {", ".join(WEIGHTINGS)}, got "{options.ray_weights}"')
+        raise NergError(f'{parameter("ray_weights")} must be {", ".join(WEIGHTINGS)}, got "{options.ray_weights}"')
     find_colormap(options.cmap)
 
 
 def load_alignment(options: BakeOptions, reporter: Reporter) -> Similarity:
     """Return the transform from the rays to the scene: --align, or that of the gaze field's training."""
     if options.align is not None:
-        return read_similarity(options.align, "--align", "rays to place", reporter.warn)
+        return read_similarity(options.align, parameter("align"), "rays to place", reporter.warn)
     return (
         Similarity()
         if options.gaze is None
@@ -341,12 +356,13 @@ def read_target(path: Path, shapes: tuple[str, ...], resolution: int, ns: Module
     if suffix == ".xml":
         meshes, occluders = _read_scene_target(path, shapes)
     elif shapes:
-        raise NergError(f'--shape applies to scene files, and "{path}" is not one; leave it out')
+        raise NergError(f'{parameter("shapes")} applies to scene files, and "{path}" is not one; leave it out')
     elif suffix == ".safetensors":
         kind = read_metadata(path).get("kind")
         if kind != "radiance":
             raise NergError(
-                f'"{path}" is not a radiance field; give the target surface first, and the gaze field with --gaze'
+                f'"{path}" is not a radiance field; give the target surface first, and the gaze field with '
+                f"{parameter('gaze')}"
             )
         reporter.progress(0.02, "extracting the surface of the field")
         field = load_radiance(path, ns)[0]
@@ -457,7 +473,10 @@ class SplatScene:
         if isinstance(part, TrackedRays):
             return sum_rays_on_splats(geometry.arrays, geometry.axes, part, self.ray_settings)
         if make is None:
-            raise NergError("there is no gaze field: name one by --gaze, or take the gaze of the rays, --source rays")
+            raise NergError(
+                f"there is no gaze field: name one by {parameter('gaze')}, or take the gaze of the rays, "
+                f"{parameter('source', 'rays')}"
+            )
         sums = self.empty_sums
         for k, weight in enumerate(part.weights.tolist()):
             eye = part.positions[k : k + 1]
@@ -610,7 +629,7 @@ def split_halves(who: TrackedRays, rays: Rays, seed: int) -> list[WeightedObserv
     """Split ``who``, which are the ``rays``, into two random halves of the participants."""
     people = np.unique(rays.person)
     if len(people) < 2:
-        raise NergError("--split-half needs at least two participants, and the rays are of one")
+        raise NergError(f"{parameter('split_half', True)} needs at least two participants, and the rays are of one")
     first = np.isin(rays.person, np.random.default_rng(seed).permutation(people)[: len(people) // 2])
     order = [np.flatnonzero(first), np.flatnonzero(~first)]
     return [

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.evaluation.metrics import cc
 from nerg_mi.fields.splats import Splats, harmonics_from_colors
 from nerg_mi.figures.overlay import Heat, overlay, robust_max
@@ -20,7 +20,6 @@ from nerg_mi.formats.splats import read_splats, write_ply_splats
 from nerg_mi.maths.color import decode_srgb
 from nerg_mi.maths.sphere import SH_C0
 from nerg_mi.progress import SILENT, Reporter
-from nerg_mi.ranges import FLAG
 from nerg_mi.rays.rays import Rays
 from nerg_mi.surfaces.laplacian import SurfaceSums, merge_sums
 from nerg_mi.surfaces.sources import RaySettings
@@ -128,8 +127,8 @@ def bake_splats(
     density = spread.density(sums)
     if not (density > 0).any():
         raise NergError(
-            f'no observer sees any of the Gaussians of "{path}"; move the observers with --observer, '
-            "--observer-file or --align"
+            f'no observer sees any of the Gaussians of "{path}"; move the observers with {parameter("observer")}, '
+            f"{parameter('observer_file')} or {parameter('align')}"
         )
     attention = factor * density * align.scale**2
     unit = UNITS[options.unit].replace("²", "^2")
@@ -234,12 +233,11 @@ def _check(paths: list[Path], options: BakeOptions, rays: Rays | None) -> str:
     check_values(options)
     for entry in fields(options):
         if entry.name in _TRIANGLE_OPTIONS and getattr(options, entry.name) != entry.default:
-            name = entry.metadata[FLAG] or "--" + entry.name.replace("_", "-")
-            raise NergError(f"{name} does not apply to Gaussian splats; leave it out")
+            raise NergError(f"{parameter(entry.name)} does not apply to Gaussian splats; leave it out")
     source = select_source(options, rays)
     if source == "field" and options.gaze is None:
         raise NergError(
-            'no gaze field is given: add --gaze FILE ("nerg train gaze RAYS --field SPLATS" trains one), or use '
-            "the recorded gaze with --source rays"
+            f'no gaze field is given: add {parameter("gaze", "FILE")} ("nerg train gaze RAYS --field SPLATS" '
+            f"trains one), or use the recorded gaze with {parameter('source', 'rays')}"
         )
     return source

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from nerg_mi.errors import MissingFile, NergError
+from nerg_mi.errors import MissingFile, NergError, parameter
 from nerg_mi.figures.overlay import (
     Heat,
     Overlay,
@@ -86,12 +86,12 @@ def difference(files: Sequence[Path], options: DifferenceOptions, reporter: Repo
     """Draw the first of two files minus the second."""
     find_colormap(options.cmap, "diverging")
     if options.vmax is not None and not (np.isfinite(options.vmax) and options.vmax > 0):
-        raise NergError(f"--vmax must be positive, got {options.vmax}")
+        raise NergError(f"{parameter('vmax')} must be positive, got {options.vmax}")
     if len(files) != 2:
         raise NergError(f"a difference needs two images, got {len(files)}; name two .exr files")
     overlay = find_channel_overlay(options.channel)
     if overlay.display.kind == "categorical":
-        raise NergError(f'"{overlay.name}" is categorical and has no difference; choose another --channel')
+        raise NergError(f'"{overlay.name}" is categorical and has no difference; choose another {parameter("channel")}')
     first, second = (read_stored(path, overlay) for path in files)
     if first.values.shape != second.values.shape:
         sizes = " and ".join(f"{v.shape[1]} x {v.shape[0]}" for v in (first.values, second.values))
@@ -189,16 +189,20 @@ def surface(files: Sequence[Path], options: BakedFigureOptions, reporter: Report
     (path,) = files
     activate_variant(options.mode)
     baked = read_baked(path)
-    up = _unit(check_point(options.up, "--up"), np.array([0.0, 0, 1]), "--up")
+    up = _unit(check_point(options.up, parameter("up")), np.array([0.0, 0, 1]), parameter("up"))
     mesh, values = baked.mesh, baked.values
     if options.clip_above is not None:
         below = (mesh.vertices[mesh.faces] @ up).min(axis=1) < options.clip_above
         if not below.any():
-            raise NergError(f'no triangle of "{path}" is below {options.clip_above:g}; give a larger --clip-above')
+            raise NergError(
+                f'no triangle of "{path}" is below {options.clip_above:g}; give a larger {parameter("clip_above")}'
+            )
         mesh = Mesh(mesh.vertices, mesh.faces[below])
     value, shade, hit = _trace_mesh(mesh, values, up, options)
     if not hit.any():
-        raise NergError(f'no part of "{path}" is in the image; give another --camera or --target')
+        raise NergError(
+            f'no part of "{path}" is in the image; give another {parameter("camera")} or {parameter("target")}'
+        )
     grey = np.where(hit, _BARE + _LIT * shade, _PAPER)
     heat = Heat(options.vmax or robust_max(value, hit), style.colormap or "inferno", decades=style.decades)
     title = options.title or baked.label.partition("[")[0].strip().capitalize()
@@ -271,15 +275,15 @@ def _camera(mesh: Mesh, up: np.ndarray, options: BakedFigureOptions) -> tuple[np
     """Return position and axes (right, up, forward) of the camera. Raises `NergError` for a degenerate camera."""
     corners = mesh.vertices[np.unique(mesh.faces)]
     lower, upper = corners.min(axis=0), corners.max(axis=0)
-    target = check_point(options.target, "--target")
+    target = check_point(options.target, parameter("target"))
     target = (lower + upper) / 2 if target is None else target
-    eye = check_point(options.camera, "--camera")
+    eye = check_point(options.camera, parameter("camera"))
     if eye is None:
         side = np.cross(up, [1.0, 0, 0] if abs(up[0]) < 0.9 else [0, 1.0, 0])
         back = np.cross(side, up)
         offset = 0.9 * up - 0.8 * side / np.linalg.norm(side) + 0.4 * back / np.linalg.norm(back)
         eye = target + offset
-    ahead = _unit(target - eye, None, "the vector from --camera to --target")
+    ahead = _unit(target - eye, None, f"the vector from {parameter('camera')} to {parameter('target')}")
     across = np.cross(ahead, up)
     if np.linalg.norm(across) < 1e-6:
         across = np.cross(ahead, np.roll(up, 1))

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.figures.maps import ParticipantPath, SightLines, Walls, floor_figure
 from nerg_mi.figures.overlay import Overlay, OverlayLayers, find_overlay, occlusion_figure, shared_limits, unknown_mask
 from nerg_mi.figures.scanpath import scanpath_figure
@@ -63,7 +63,7 @@ def floor(files: Sequence[Path], options: FloorOptions, reporter: Reporter) -> D
     if not len(rays):
         raise NergError(f'"{path}" contains no rays; give another file')
     if not options.cut_height > 0:
-        raise NergError(f"--cut-height must be above 0, got {options.cut_height}")
+        raise NergError(f"{parameter('cut_height')} must be above 0, got {options.cut_height}")
     low, high = _corners(rays)
     inputs, walls = [path], None
     if options.scene is not None:
@@ -334,13 +334,16 @@ def scanpath(files: Sequence[Path], options: ScanpathOptions, reporter: Reporter
 
     (path,) = files
     if options.scene is None:
-        raise NergError("a scanpath is drawn over a view of a scene; name its file with --scene")
+        raise NergError(f"a scanpath is drawn over a view of a scene; name its file with {parameter('scene')}")
     rays = load_rays(path)
     rays = _select_participants(rays, rays.persons[0] if options.participants is None else options.participants)
     low, high = (-np.inf if options.start is None else options.start), (np.inf if options.end is None else options.end)
     rays = rays.select((rays.t >= low) & (rays.t <= high))
     if not len(rays):
-        raise NergError(f'"{path}" has no rays of these participants in this time; change --participants or --start')
+        raise NergError(
+            f'"{path}" has no rays of these participants in this time; change {parameter("participants")} or '
+            f"{parameter('start')}"
+        )
     warn_unknown_tracking(rays.tracking, reporter.warn)
     warn_slow_sampling(rays, options, reporter)
     rules, dispersion = options.event_rules(), options.dispersion_threshold

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.environment.environment import Environment
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.evaluation import gaze as evaluation
 from nerg_mi.evaluation.baselines import (
     CONDITIONAL_KDE,
@@ -298,7 +298,8 @@ def load_training_rays(gaze: Path, training: dict, rays: Rays | str | Path) -> R
         raise NergError(f'"{gaze}" is a prior from other scenes, for which no rays of this scene were held out')
     if "test" not in training:
         raise NergError(
-            f'"{gaze}" was trained on all positions, so there are no held-out ones; train with --test-zones 3'
+            f'"{gaze}" was trained on all positions, so there are no held-out ones; train with '
+            f"{parameter('test_zones', 3)}"
         )
     if isinstance(rays, Rays):
         return rays
@@ -498,7 +499,7 @@ def _splits(text: str) -> list[str]:
     splits = list(dict.fromkeys(text.split(",")))
     unknown = [split for split in splits if split not in SPLITS]
     if unknown:
-        raise NergError(f'--splits must be some of {", ".join(SPLITS)}, got "{unknown[0]}"')
+        raise NergError(f'{parameter("splits")} must be some of {", ".join(SPLITS)}, got "{unknown[0]}"')
     return splits
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.fields.gaze_base import AnyGazeField
 from nerg_mi.fields.occupancy import RefinedGrid, refine_occupancy
 from nerg_mi.fields.radiance import RadianceField
@@ -86,15 +86,15 @@ def import_checkpoint(
         field, attention, origin = read_nerg(file, ns, options.ema, settings)
     else:
         if gaze is not None:
-            raise NergError(f'"{file}" contains no gaze field: leave out --gaze')
+            raise NergError(f'"{file}" contains no gaze field: leave out {parameter("gaze")}')
         (field, origin), attention = read_torch_ngp(file, ns, options.ema, settings), None
     if field is not None:
         field.occupancy = refine_occupancy(field) or field.occupancy
     if output is not None:
         if field is None:
             raise NergError(
-                f'"{file}" contains a gaze field but no NeRF: write it with --gaze alone, without -o, and import the '
-                "NeRF from its own file"
+                f'"{file}" contains a gaze field but no NeRF: write it with {parameter("gaze")} alone, without '
+                f"{parameter('output')}, and import the NeRF from its own file"
             )
         save_radiance(field, output, origin, options.half)
         reporter.message(_describe_field(field, origin))
@@ -105,7 +105,7 @@ def import_checkpoint(
         reporter.message(f"gaze: {config.variant}, trunk {config.trunk}, bound {attention.box.side / 2:g}")
         _report_written(gaze, reporter)
     elif attention is not None:
-        reporter.message(f'"{file}" also contains a gaze field: write it with --gaze NAME.safetensors')
+        reporter.message(f'"{file}" also contains a gaze field: write it with {parameter("gaze", "NAME.safetensors")}')
     return ImportedFields(field, attention, origin, [path for path in (output, gaze) if path is not None])
 
 
@@ -114,7 +114,10 @@ def import_to_files(
 ) -> None:
     """Call `import_checkpoint` with at least one output file."""
     if output is None and gaze is None:
-        raise NergError("no output is given: add -o FIELD.safetensors, --gaze GAZE.safetensors, or both")
+        raise NergError(
+            f"no output is given: add {parameter('output', 'FIELD.safetensors')}, "
+            f"{parameter('gaze', 'GAZE.safetensors')}, or both"
+        )
     import_checkpoint(file, output, gaze, options, reporter)
 
 
@@ -276,7 +279,7 @@ def _load(field: str | Path | RadianceField, mode: str, reporter: Reporter) -> R
 
 def _surface_writer(output: Path, up: str) -> Callable[[Surface, Path], None]:
     if up not in ("y", "z"):
-        raise NergError(f'--up must be z or y, got "{up}"')
+        raise NergError(f'{parameter("up")} must be z or y, got "{up}"')
     check_writable(output, ".ply", ".glb")
     if output.suffix.lower() == ".ply":
         return write_ply

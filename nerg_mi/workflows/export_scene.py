@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError, translate_mitsuba_errors
+from nerg_mi.errors import NergError, parameter, translate_mitsuba_errors
 from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.figures.overlay import Heat, robust_max
 from nerg_mi.figures.style import apply_colormap
@@ -98,7 +98,7 @@ def export_scene(
     options, output = options or SceneExportOptions(), Path(output)
     check_exchange(output)
     if options.up not in ("y", "z"):
-        raise NergError(f'--up must be z or y, got "{options.up}"')
+        raise NergError(f'{parameter("up")} must be z or y, got "{options.up}"')
     activate_variant(options.mode)
     scene = ExchangeScene(up=options.up, meters_per_unit=options.meters_per_unit)
     paths = [Path(file) for file in files]

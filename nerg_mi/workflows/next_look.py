@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.environment.environment import Environment
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.evaluation.baselines import UNIFORM_DENSITY, Baseline, make_prior_baseline
 from nerg_mi.evaluation.gaze import EPS, FieldDensity, format_score_table
 from nerg_mi.evaluation.gaze_report import explain_missing, format_table
@@ -108,10 +108,13 @@ def evaluate_next_look(
     """
     options, gaze = options or NextLookOptions(), Path(gaze)
     if options.head and options.elapsed is not None:
-        raise NergError("--head predicts gaze at the same time, so that --elapsed does not apply; leave out one")
+        raise NergError(
+            f"{parameter('head', True)} predicts gaze at the same time, so that {parameter('elapsed')} does not "
+            "apply; leave out one"
+        )
     knots = (1.0,) if options.head else _ELAPSED if options.elapsed is None else options.elapsed
     if not knots or not (np.diff(knots) > 0).all():
-        raise NergError(f"--elapsed needs increasing times in seconds, as 0.2,1,5, got {list(knots)}")
+        raise NergError(f"{parameter('elapsed')} needs increasing times in seconds, as 0.2,1,5, got {list(knots)}")
     if output is not None:
         check_folder(Path(output))
     from scipy.spatial import KDTree
@@ -122,7 +125,7 @@ def evaluate_next_look(
     data = load_training_rays(gaze, training, rays)
     holdout = training["test"]
     if not holdout.get("people"):
-        raise NergError(f'"{gaze}" held out no participants to score; train with --test-participants 0.5')
+        raise NergError(f'"{gaze}" held out no participants to score; train with {parameter("test_participants", 0.5)}')
     environment = load_training_geometry(
         gaze, training, loaded.box, ns, field=options.field, scene=options.scene, choice=options.geometry
     )
@@ -145,12 +148,12 @@ def evaluate_next_look(
     if min(map(len, rows)) < _MIN_LOOKS:
         raise NergError(
             f"only {len(rows[0])} looks of training participants and {len(rows[1])} of others are near held-out "
-            "positions; train with more --test-zones or a larger --radius"
+            f"positions; train with more {parameter('test_zones')} or a larger {parameter('radius')}"
         )
     if len(np.unique(zone[rows[0]])) < 2:
         reporter.warn(
-            "the weights are fitted in the only zone of held-out positions and scored there; for scores in new zones, "
-            "train with --test-zones 3"
+            "the weights are fitted in the only zone of held-out positions and scored there; for scores in new "
+            f"zones, train with {parameter('test_zones', 3)}"
         )
     eyes = environment.points_to_field(data.origin[np.concatenate(rows)])
     warn_extrapolation(reporter.warn, environment.scene_geometry, GazeFieldInstance(loaded), eyes)
@@ -196,7 +199,8 @@ def _sample_looks(
         past, matched = find_past(rows, elapsed)
         if len(matched) < _MIN_LOOKS:
             raise NergError(
-                f"only {len(matched)} of {len(rows)} looks have another one {elapsed:g} s before; change --elapsed"
+                f"only {len(matched)} of {len(rows)} looks have another one {elapsed:g} s before; change "
+                f"{parameter('elapsed')}"
             )
         pasts.append(past)
         parts.append(matched)

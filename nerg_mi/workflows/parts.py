@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.files.safe_read import resolve_path
 from nerg_mi.files.tables import format_markdown_table
 from nerg_mi.options import PartOptions
@@ -92,7 +92,7 @@ def account_for_store(folder: str | Path, remove: bool = False, reporter: Report
     ended an hour ago or earlier. Raises `NergError` if the folder is not a store.
     """
     if not Path(folder).is_dir():
-        raise NergError(f'there is no folder "{folder}"; give the folder that was given as --store')
+        raise NergError(f'there is no folder "{folder}"; give the folder that was given as {parameter("store")}')
     reporter.progress(0.0, "reading the store")
     store = Store(folder)
     account = read_status(store)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.figures.maps import camera_figure
 from nerg_mi.figures.style import make_provenance, save
 from nerg_mi.files.atomic import check_new_folder, create_folder_atomically, make_folder
@@ -209,11 +209,13 @@ def _report_result(
     else:
         reporter.message(f"rotated so that up is +z: {reconstruction.up}")
         if not reconstruction.up.is_reliable:
-            reporter.warn("the cameras disagree on the up direction; check poses.png, or use --no-orient")
+            reporter.warn(
+                f"the cameras disagree on the up direction; check poses.png, or use {parameter('orient', False)}"
+            )
     spread = float(np.max(np.ptp(reconstruction.to_world[:, :3, 3], axis=0)))
     reporter.message(
-        f"lengths are in arbitrary units (the cameras span {spread:.3g}); set the scale with --scale of nerg "
-        "train radiance"
+        f"lengths are in arbitrary units (the cameras span {spread:.3g}); set the scale with {parameter('scale')} "
+        "of nerg train radiance"
     )
     other_models = [part for part in reconstruction.models[1:] if set(part) - set(result.registered)]
     if other_models:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError, sanitize
+from nerg_mi.errors import NergError, parameter, sanitize
 from nerg_mi.figures import maps, style
 from nerg_mi.figures.style import existing_files, make_provenance
 from nerg_mi.files.atomic import check_new_folder, check_writable, create_folder_atomically
@@ -228,7 +228,9 @@ def filter_dataset(path: FileName, options: FilterOptions, reporter: Reporter) -
         events.warn_unknown_tracking(dataset.metadata.get("tracking", "unknown"), reporter.warn)
     if output is not None and Path(output).suffix.lower() == DATASET:
         if options.sample is not None:
-            raise NergError("--sample needs a file as output; use an output name that ends in .npz or .parquet")
+            raise NergError(
+                f"{parameter('sample')} needs a file as output; use an output name that ends in .npz or .parquet"
+            )
         check_new_folder(output)
         with create_folder_atomically(output) as folder:
             _write_filtered(dataset, options, steps, folder)
@@ -306,8 +308,9 @@ def _load_selected(dataset: RayDataset, options: FilterOptions, steps: _Totals) 
         count += len(block)
         if count > MAX_LOADED_RAYS:
             raise NergError(
-                f"more than {MAX_LOADED_RAYS:,} rays are selected, {MAX_LOADED_RAYS * BYTES_PER_RAY / 1e9:.2g} "
-                f"GB: narrow the conditions, add --sample, or write a dataset (-o NAME{DATASET})"
+                f"more than {MAX_LOADED_RAYS:,} rays are selected, {MAX_LOADED_RAYS * BYTES_PER_RAY / 1e9:.2g} GB: "
+                f"narrow the conditions, add {parameter('sample')}, or write a dataset "
+                f"({parameter('output', 'NAME' + DATASET)})"
             )
     return blocks
 
@@ -409,8 +412,8 @@ def _transform_to_files(rays: Rays) -> list[list[float]]:
     back = np.linalg.inv(np.array(rays.metadata["transform"], np.float64))
     if np.linalg.det(back[:3, :3]) < 0:
         raise NergError(
-            "the frame of the files is left-handed and that of rays right-handed, so no similarity connects "
-            "them; leave out --align-output, and align the rays with the scene"
+            "the frame of the files is left-handed and that of rays right-handed, so no similarity connects them; "
+            f"leave out {parameter('align_output')}, and align the rays with the scene"
         )
     return (back + 0.0).tolist()
 
@@ -422,7 +425,8 @@ def import_files(
     settings = {name: value for name, value in settings.items() if value is not None and value is not False}
     if (preset is None) == ("columns" not in settings):
         raise NergError(
-            "the format of the files is not given: add --preset NAME or --map COLUMNS; nerg rays guess proposes one"
+            f"the format of the files is not given: add {parameter('preset', 'NAME')} or "
+            f"{parameter('columns', 'COLUMNS')}; nerg rays guess proposes one"
         )
     reader = preset or TABLE
     options = replace(options, reader=reader, settings=parse_options(reader, settings))

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.options import (
     ALIGN_HELP,
     ANALYSIS,
@@ -96,14 +96,21 @@ class RaysImportOptions(ValidatedDataclass):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.salt is not None and not self.pseudonyms:
-            raise NergError("--salt needs --pseudonyms; add it, or leave out --salt")
-        of_datasets = {"--environment": self.environment, "--day": self.day, "--workers": self.workers}
+            raise NergError(
+                f"{parameter('salt')} needs {parameter('pseudonyms', True)}; add it, or leave out {parameter('salt')}"
+            )
+        of_datasets = {
+            parameter("environment"): self.environment,
+            parameter("day"): self.day,
+            parameter("workers"): self.workers,
+        }
         explicit = [flag for flag, value in of_datasets.items() if value is not None]
         if explicit and not self.into_dataset:
             raise NergError(f"{explicit[0]} applies to datasets only; use an output name that ends in {DATASET}")
         if self.align_output is not None and self.into_dataset:
             raise NergError(
-                "--align-output does not apply to datasets, whose sources may differ in their frames; write a rays file"
+                f"{parameter('align_output')} does not apply to datasets, whose sources may differ in their "
+                "frames; write a rays file"
             )
 
     @property
@@ -200,13 +207,16 @@ class FilterOptions(ValidatedDataclass):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.fixations not in (None, *DETECTORS):
-            raise NergError(f'--fixations must be ivt or idt, got "{self.fixations}"')
+            raise NergError(f'{parameter("fixations")} must be ivt or idt, got "{self.fixations}"')
         if self.merge_fixations and self.fixations is None:
-            raise NergError("--merge-fixations needs a detector; add --fixations ivt or --fixations idt")
+            raise NergError(
+                f"{parameter('merge_fixations', True)} needs a detector; add {parameter('fixations', 'ivt')} or "
+                f"{parameter('fixations', 'idt')}"
+            )
         if not self.conditions and not self.follows and self.sample is None:
             raise NergError(
-                "no selection is given; add for instance --start, --person, --box, --fixations, --thin or --sample "
-                "(--help lists all)"
+                f"no selection is given; add for instance {parameter('start')}, {parameter('persons')}, "
+                f"{parameter('box')}, {parameter('fixations')}, {parameter('thin')} or {parameter('sample')}"
             )
 
     @property
@@ -280,8 +290,9 @@ class SplitOptions(ValidatedDataclass):
         super().__post_init__()
         if not (self.test_zones or self.test_participants or self.persons or self.test_time):
             raise NergError(
-                "no criterion is given for the split; add --test-zones 3, --test-participants 0.5, --person NAME or "
-                "--test-time 0.2, or several of them"
+                f"no criterion is given for the split; add {parameter('test_zones', 3)}, "
+                f"{parameter('test_participants', 0.5)}, {parameter('persons', 'NAME')} or "
+                f"{parameter('test_time', 0.2)}, or several of them"
             )
 
 
@@ -310,9 +321,9 @@ class PlotOptions(ValidatedDataclass):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.kind not in PLANS:
-            raise NergError(f'--kind must be density or layout, got "{self.kind}"')
+            raise NergError(f'{parameter("kind")} must be density or layout, got "{self.kind}"')
         if self.kind == "density" and self.test is not None:
-            raise NergError("--test applies to layouts only; add --kind layout")
+            raise NergError(f"{parameter('test')} applies to layouts only; add {parameter('kind', 'layout')}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -355,7 +366,10 @@ class RaysExportOptions(EventOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.aois is None and (self.scene is not None or self.align is not None):
-            raise NergError("--scene and --align are for the visits of AOIs; add --aois, or leave them out")
+            raise NergError(
+                f"{parameter('scene')} and {parameter('align')} are for the visits of AOIs; add "
+                f"{parameter('aois')}, or leave them out"
+            )
 
 
 def _reader_parameters() -> Mapping[str, Parameter]:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.files.atomic import check_writable
 from nerg_mi.files.tables import add_notes, unescape_formula, write_csv
 from nerg_mi.files.values import find_names
@@ -124,7 +124,7 @@ def read_targets(path: Path, participants: Sequence[str]) -> list[GazeTarget]:
             except NergError as error:
                 raise NergError(f"{path}, line {line}: {error}; correct it") from error
     if not targets:
-        raise NergError(f"{path} has no targets; add rows, or leave out --targets")
+        raise NergError(f"{path} has no targets; add rows, or leave out {parameter('targets')}")
     return targets
 
 
@@ -136,7 +136,7 @@ def warn_slow_sampling(rays: Rays, options: EventOptions, reporter: Reporter) ->
     if interval > longest * (1 - 1e-6):
         reporter.warn(
             f"samples are {interval:.3g} s apart, and intervals above {longest:g} s are pauses: raise "
-            "--max-step; saccades, which last 0.02 to 0.1 s, are not resolved"
+            f"{parameter('max_step')}; saccades, which last 0.02 to 0.1 s, are not resolved"
         )
 
 

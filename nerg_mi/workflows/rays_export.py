@@ -14,7 +14,7 @@ from nerg_mi import __version__
 from nerg_mi.aoi.measured import find_area_visits
 from nerg_mi.aoi.options import CountOptions
 from nerg_mi.aoi.predicted import load_aoi_scene
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.files.atomic import check_new_folder
 from nerg_mi.formats.areas import read_areas
 from nerg_mi.measures.visits import Visits
@@ -126,7 +126,10 @@ def _events(
 
 def _join(parts: Sequence[BidsEvents]) -> BidsEvents:
     if not parts:
-        raise NergError("there are no areas of interest in the file of --aois; add one, or leave out --aois")
+        raise NergError(
+            f"there are no areas of interest in the file of {parameter('aois')}; add one, or leave out "
+            f"{parameter('aois')}"
+        )
     join = lambda get: np.concatenate([get(part) for part in parts])
     return BidsEvents(
         join(lambda e: e.row),

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError, translate_mitsuba_errors
+from nerg_mi.errors import NergError, parameter, translate_mitsuba_errors
 from nerg_mi.figures import style
 from nerg_mi.figures.overlay import Limits, Overlay, OverlayLayers, Style, find_overlay, shared_limits
 from nerg_mi.figures.shading import draw_outlines, smooth_on_surfaces
@@ -84,8 +84,8 @@ def check_overlay(output: Path, options: PictureOptions) -> None:
     if options.overlay is None:
         for name, default in _OVERLAY_DEFAULTS:
             if getattr(options, name) != default:
-                flag = "--no-hatching" if name == "hatching" else f"--{name.replace('_', '-')}"
-                raise NergError(f"{flag} applies to overlays only; add --overlay")
+                mention = parameter(name, False if name == "hatching" else "")
+                raise NergError(f"{mention} applies to overlays only; add {parameter('overlay')}")
         return
     overlay = find_overlay(options.overlay)
     if output.suffix.lower() not in OVERLAY_FORMATS:
@@ -210,8 +210,8 @@ def check_memory(path: Path, camera: Any, options: PictureOptions) -> None:
     needed = BYTES_PER_PIXEL * width * height / 1e9
     if needed > options.memory:
         raise NergError(
-            f"drawing an overlay of {width:,} x {height:,} pixels needs {needed:.2g} GB; increase --memory to "
-            f'{needed:.1f}, or reduce the size of "{path}"'
+            f"drawing an overlay of {width:,} x {height:,} pixels needs {needed:.2g} GB; increase "
+            f'{parameter("memory")} to {needed:.1f}, or reduce the size of "{path}"'
         )
 
 
@@ -591,15 +591,18 @@ def _check_video(output: Path, options: PictureOptions) -> bool:
     if output.suffix.lower() == VIDEO:
         if options.frames is None:
             raise NergError(
-                f'"{output}" is a video, and there is a single image; add --frames, or use another name (.png)'
+                f'"{output}" is a video, and there is a single image; add {parameter("frames")}, or use another '
+                "name (.png)"
             )
         check_video_output(options.fps)
         return True
     if options.fps != PictureOptions().fps:
-        raise NergError(f'--fps applies to videos only, and "{output}" is not one; use a name that ends in {VIDEO}')
+        raise NergError(
+            f'{parameter("fps")} applies to videos only, and "{output}" is not one; use a name that ends in {VIDEO}'
+        )
     if options.overlay is None and output.suffix.lower() not in IMAGE_FORMATS:
         raise NergError(
-            f'"{output}" can only hold an overlay; add --overlay, or use a name that ends in '
+            f'"{output}" can only hold an overlay; add {parameter("overlay")}, or use a name that ends in '
             f"{' or '.join(IMAGE_FORMATS)}"
         )
     return False

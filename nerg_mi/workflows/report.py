@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.environment.environment import Environment
-from nerg_mi.errors import MissingFile, NergError, sanitize, translate_mitsuba_errors
+from nerg_mi.errors import MissingFile, NergError, parameter, sanitize, translate_mitsuba_errors
 from nerg_mi.evaluation.gaze_report import GazeResults, read_results
 from nerg_mi.fields.gaze_base import AnyGazeField, tracking_suffix
 from nerg_mi.figures import maps, overlay
@@ -311,7 +311,7 @@ def compute_results(
 ) -> list[GazeResults]:
     """Compute the evaluations of the splits that are not in ``have``."""
     if files.rays is None:
-        raise NergError("--evaluate needs the rays of the training; name their file")
+        raise NergError(f"{parameter('evaluate', True)} needs the rays of the training; name their file")
     account = files.scene.gaze_provenance.get("test") or {}
     splits = ("both", "pos", "people") if account.get("people") else ("pos",)
     environment = {"field": "field", "scene": "scene", "hits": "geometry"}.get(files.scene.kind)
@@ -530,7 +530,8 @@ def make_report(
         reporter.message(verdict.sentence)
     if not run.results:
         reporter.message(
-            "there is no evaluation, so the report has no verdict; add --evaluate to compute one from rays"
+            f"there is no evaluation, so the report has no verdict; add {parameter('evaluate', True)} to compute "
+            "one from rays"
         )
     reporter.message(f"wrote {output} ({size:.1f} MB)")
     return ReportResult(output, run)
@@ -642,7 +643,8 @@ class _ReportWork:
             observer = tuple(to_scene_frame(support_of_rays(self.rays).find_densest_position(), self.align).tolist())
         if observer is None and self.field.support is None and self.files.scene.kind != "none":
             self.reporter.message(
-                "no recorded positions are known: the camera is the observer; use --observer x,y,z to place one"
+                "no recorded positions are known: the camera is the observer; use "
+                f"{parameter('observer', 'x,y,z')} to place one"
             )
         scene_options = SceneOptions(
             observer=observer, camera=o.camera, target=o.target, fov=o.fov, width=o.width, mode=o.mode

@@ -11,7 +11,7 @@ import numpy as np
 
 from nerg_mi.alignment.check import read_similarity
 from nerg_mi.environment.environment import make_hit_geometry
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.figures.overview import PinholeFrame, SeenSurfaces
 from nerg_mi.files.atomic import check_writable, write_text
 from nerg_mi.formats.fields import load_gaze
@@ -199,7 +199,7 @@ def write_scene(
     align = (
         inputs.align
         if options.align is None
-        else read_similarity(options.align, "--align", "rays to place", reporter.warn)
+        else read_similarity(options.align, parameter("align"), "rays to place", reporter.warn)
     )
     scene_rays = load_scene_rays(inputs.rays, output, reporter)
     inputs, rays = replace(inputs, rays=scene_rays.file), scene_rays.rays
@@ -229,7 +229,7 @@ def write_scene(
         if sentence := describe_observer(probe.scene):
             reporter.warn(sentence)
         elif seen is not None and observer is not None and not seen.is_hit.any() and inputs.kind != "none":
-            reporter.warn("the observer sees no surface; move it with --observer, or check the alignment")
+            reporter.warn(f"the observer sees no surface; move it with {parameter('observer')}, or check the alignment")
         if observer is not None and seen is not None and walk is None and options.person is None:
             observer = make_upright(turn_to_attention(observer, seen), up)
             scene = replace(scene, observer=observer)
@@ -246,7 +246,10 @@ def write_scene(
         write_text(probe_file, scene.text(probe_file.parent, camera, lens, 96).to_xml())
         probed = load_scene(probe_file, values)
         if not sees_anything(probed):
-            raise NergError("the image of the camera would be empty; choose another one with --camera and --target")
+            raise NergError(
+                f"the image of the camera would be empty; choose another one with {parameter('camera')} and "
+                f"{parameter('target')}"
+            )
     text = scene.text(output.parent, camera, lens, options.width)
     text = replace(
         text,
@@ -311,20 +314,26 @@ def _check_options(options: SceneOptions) -> None:
     """Raise `NergError` for options that contradict or need each other."""
     moment = options.time is not None or options.time_range is not None
     if moment != (options.person is not None) or (options.time is not None and options.time_range is not None):
-        raise NergError("--person needs one of --time and --time-range, and these need --person; give both, or neither")
+        raise NergError(
+            f"{parameter('person')} needs one of {parameter('time')} and {parameter('time_range')}, and these need "
+            f"{parameter('person')}; give both, or neither"
+        )
     if options.person is not None and options.observer is not None:
-        raise NergError("--observer and --person both place the observer; leave out one of them")
+        raise NergError(
+            f"{parameter('observer')} and {parameter('person')} both place the observer; leave out one of them"
+        )
     if options.photo is not None and options.photos is None:
-        raise NergError("--photo needs the photos of the training; add --photos DATASET")
+        raise NergError(f"{parameter('photo')} needs the photos of the training; add {parameter('photos', 'DATASET')}")
     cameras = [options.camera is not None, options.photos is not None, options.first_person]
     if sum(cameras) > 1 or (options.target is not None and options.camera is None):
         raise NergError(
-            "the camera is set by --camera and --target, by --photos or by --first-person; give one of these"
+            f"the camera is set by {parameter('camera')} and {parameter('target')}, by {parameter('photos')} or by "
+            f"{parameter('first_person', True)}; give one of these"
         )
     if options.time_range is not None and len(options.time_range) != 2:
-        raise NergError(f"--time-range must be two times A,B, got {len(options.time_range)}")
+        raise NergError(f"{parameter('time_range')} must be two times A,B, got {len(options.time_range)}")
     for name in ("observer", "camera", "target", "up"):
-        check_point(getattr(options, name), f"--{name}")
+        check_point(getattr(options, name), parameter(name))
 
 
 def _with_hits(
@@ -334,7 +343,7 @@ def _with_hits(
     if inputs.kind != "hits" or inputs.environment is not None:
         return inputs, ()
     if rays is None:
-        raise NergError("--geometry hits needs rays; name their file")
+        raise NergError(f"{parameter('geometry', 'hits')} needs rays; name their file")
     path = output.with_suffix(".vol")
     made = make_hit_geometry(rays, path).metadata["geometry_file"]
     size = " x ".join(map(str, made["shape"]))
@@ -344,7 +353,7 @@ def _with_hits(
 
 def _up(inputs: InputFiles, align: Similarity, options: SceneOptions) -> np.ndarray:
     """Return the up direction: as given, that of the rays, that of the radiance field, or +z."""
-    up = check_point(options.up, "--up")
+    up = check_point(options.up, parameter("up"))
     if up is None and (inputs.rays is not None or "rays_file" in inputs.gaze_provenance or not align.is_identity):
         up = align.matrix[:3, 2] / align.scale
     if up is None:
@@ -352,7 +361,7 @@ def _up(inputs: InputFiles, align: Similarity, options: SceneOptions) -> np.ndar
         up = np.array([0.0, 0, 1]) if stored is None else np.asarray(stored, float)
     length = float(np.linalg.norm(up))
     if up.shape != (3,) or not (np.isfinite(length) and length > 0):
-        raise NergError("up must be a direction, three numbers that are not all 0; give --up x,y,z")
+        raise NergError(f"up must be a direction, three numbers that are not all 0; give {parameter('up', 'x,y,z')}")
     return up / length
 
 
@@ -360,7 +369,7 @@ def _observer(
     inputs: InputFiles, rays: Rays | None, align: Similarity, ns, options: SceneOptions, reporter: Reporter
 ) -> tuple[LookAt | None, ObserverPath | None, str]:
     """Return the observer, its walk, and a sentence on them."""
-    point = check_point(options.observer, "--observer")
+    point = check_point(options.observer, parameter("observer"))
     if point is not None:
         return (
             LookAt(point, point + np.array([1.0, 0, 0])),
@@ -369,7 +378,7 @@ def _observer(
         )
     if options.person is not None:
         if rays is None:
-            raise NergError("--person needs rays; name their file")
+            raise NergError(f"{parameter('person')} needs rays; name their file")
         if options.time_range is not None:
             first, last = options.time_range
             walk = interpolate_walk(rays, options.person, first, last, options.fps, options.max_gap, align)
@@ -394,10 +403,12 @@ def _observer(
             return LookAt(at, at + np.array([1.0, 0, 0])), None, words
         if inputs.kind == "none":
             raise NergError(
-                f'"{inputs.gaze}" stores neither geometry nor recorded positions; place the observer with --observer'
+                f'"{inputs.gaze}" stores neither geometry nor recorded positions; place the observer with '
+                f"{parameter('observer')}"
             )
         reporter.message(
-            "no recorded positions are known: the camera is the observer; use --observer x,y,z to place one"
+            f"no recorded positions are known: the camera is the observer; use {parameter('observer', 'x,y,z')} to "
+            "place one"
         )
     return None, None, ""
 
@@ -419,7 +430,7 @@ def _camera(
             reporter.message(f"the lens of {photo.name} has distortion, which this camera has not")
         lens = photo.lens if options.fov is None else replace(photo.lens, fov=options.fov)
         return photo.eye, lens, f"The camera of sensor 0: {words}."
-    origin, target = check_point(options.camera, "--camera"), check_point(options.target, "--target")
+    origin, target = check_point(options.camera, parameter("camera")), check_point(options.target, parameter("target"))
     if origin is not None:
         if target is None:
             target = None if seen is None else seen.mean_target()
@@ -428,19 +439,26 @@ def _camera(
         return LookAt(origin, target), lens, "The camera of sensor 0, and its target."
     if options.first_person or (scene.inputs.kind == "none" and scene.observer is not None):
         if scene.observer is None:
-            raise NergError("--first-person needs an observer; add --observer or --person")
+            raise NergError(
+                f"{parameter('first_person', True)} needs an observer; add {parameter('observer')} or "
+                f"{parameter('person')}"
+            )
         return scene.observer, lens, "The camera of sensor 0: the observer's eye."
     frame = PinholeFrame(lens.fov, lens.aspect, scene.up)
     box = scene.inputs.field_metadata.get("box") if scene.inputs.kind == "field" else None
     shot = find_best_camera(probe, seen, frame, box)
     if shot is None:
-        raise NergError("no camera position with a view of the scene was found; set one with --camera and --target")
+        raise NergError(
+            f"no camera position with a view of the scene was found; set one with {parameter('camera')} and "
+            f"{parameter('target')}"
+        )
     whose = "what the observer looks at" if probe.quantity else "the surroundings of the observer"
     attended = "" if shot.attention_share is None else f" and {100 * shot.attention_share:.0f} % of {whose}"
     words = f"The camera of sensor 0: the best overview; it shows surfaces in {100 * shot.surface_fraction:.0f} %"
     if scene.inputs.kind == "field" and seen is None:
         reporter.message(
-            "a field looks best from the positions of its photos: --photos DATASET uses the camera of one of them"
+            f"a field looks best from the positions of its photos: {parameter('photos', 'DATASET')} uses the "
+            "camera of one of them"
         )
     return LookAt(shot.origin, shot.target), lens, f"{words} of the image{attended}."
 

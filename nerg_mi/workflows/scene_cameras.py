@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError, translate_mitsuba_errors
+from nerg_mi.errors import NergError, parameter, translate_mitsuba_errors
 from nerg_mi.fields.gaze_base import RaySupport
 from nerg_mi.figures.overview import PinholeFrame, ScoredView, SeenSurfaces, ViewScorer, view_of_observer, view_of_scene
 from nerg_mi.files.values import find_names
@@ -182,7 +182,7 @@ def make_upright(eye: LookAt, up: np.ndarray) -> LookAt:
     """
     ahead = np.subtract(eye.target, eye.origin)
     if not np.any(np.abs(ahead) > 1e-9 * (1 + np.abs(eye.origin))):
-        raise NergError("camera position and target are the same; choose another --target")
+        raise NergError(f"camera position and target are the same; choose another {parameter('target')}")
     nearest = _MIN_DISTANCE * float(np.abs(eye.origin).max())
     if np.linalg.norm(ahead) < nearest:
         eye = replace(eye, target=eye.origin + ahead * (nearest / np.linalg.norm(ahead)))
@@ -237,11 +237,11 @@ def interpolate_walk(
     if there is no frame.
     """
     if not first < last:
-        raise NergError(f"--time-range must be two times, the earlier first, got {first:g},{last:g}")
+        raise NergError(f"{parameter('time_range')} must be two times, the earlier first, got {first:g},{last:g}")
     if (last - first) * fps > MAX_FRAMES:
         raise NergError(
             f"a walk can have at most {MAX_FRAMES:,} frames, and {last - first:g} s at {fps:g} frames per second "
-            "have more; reduce --fps, or the time range"
+            f"have more; reduce {parameter('fps')}, or the time range"
         )
     rows = _find_person_rows(rays, person)
     rows = rows[np.argsort(rays.t[rows], kind="stable")]
@@ -287,7 +287,7 @@ def _describe_missing(rays: Rays, rows: np.ndarray, person: str, when: str, gap:
     first, last = float(rays.t[rows].min()), float(rays.t[rows].max())
     return (
         f'there is no ray of "{person}" within {gap:g} s {when}; its rays are from {first:.10g} to {last:.10g} s; '
-        "increase --max-gap to bridge longer pauses"
+        f"increase {parameter('max_gap')} to bridge longer pauses"
     )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from nerg_mi.environment.environment import DEFAULT_DEPTH
 from nerg_mi.environment.hits import shade_hits
-from nerg_mi.errors import MissingFile, NergError, sanitize
+from nerg_mi.errors import MissingFile, NergError, parameter, sanitize
 from nerg_mi.files.safe_read import check_regular_file, resolve_path, translate_read_errors
 from nerg_mi.formats.checkpoint import read_metadata
 from nerg_mi.formats.fields import matches_checksum
@@ -123,7 +123,7 @@ def recognise(files: Sequence[Path], geometry: str | None, reporter: Reporter) -
     that still has to be built has kind "hits" and no file. Raises `NergError` for files that do not make a scene.
     """
     if geometry not in (None, "hits", "none"):
-        raise NergError(f'--geometry must be "hits" or "none", got "{geometry}"')
+        raise NergError(f'{parameter("geometry")} must be "hits" or "none", got "{geometry}"')
     by_role: dict[str, tuple[str, Path]] = {}
     for path in files:
         kind = detect_kind(path)
@@ -137,10 +137,13 @@ def recognise(files: Sequence[Path], geometry: str | None, reporter: Reporter) -
     provenance = {} if gaze is None else read_metadata(gaze).get("provenance", {})
     kind, environment = by_role.get("environment", ("none", None))
     if environment is not None and geometry is not None:
-        raise NergError(f'--geometry applies to rays alone, and there is "{environment}"; leave out one of them')
+        raise NergError(
+            f'{parameter("geometry")} applies to rays alone, and there is "{environment}"; leave out one of them'
+        )
     if gaze is not None and geometry is not None:
         raise NergError(
-            f'--geometry applies to rays alone, and "{gaze}" is shown in the geometry of its training; leave it out'
+            f'{parameter("geometry")} applies to rays alone, and "{gaze}" is shown in the geometry of its '
+            "training; leave it out"
         )
     if environment is not None and gaze is not None:
         _compare(environment, gaze, provenance, reporter)
@@ -240,7 +243,9 @@ def load_photo_cameras(
 def _posed(photos: Path, provenance: dict, allow_outside: bool) -> PosedImages:
     posed = read_posed_images(find_pose_source(photos), allow_outside)
     if "sha256" in provenance and provenance["sha256"] != posed.sha256:
-        raise NergError(f'the field was not trained on "{posed.path}"; give the photos of its training with --photos')
+        raise NergError(
+            f'the field was not trained on "{posed.path}"; give the photos of its training with {parameter("photos")}'
+        )
     if "to_file" in provenance:
         posed = posed.transform(invert_similarity(provenance["to_file"], '"to_file" of the field'))
     return posed
@@ -271,8 +276,8 @@ def _frame(posed: PosedImages, photo: str) -> PosedFrame:
     if photo.isdecimal() and int(photo) < len(frames):
         return frames[int(photo)]
     raise NergError(
-        f'there is no photo "{sanitize(photo, 80)}" in "{posed.path}": give --photo a number from 0 to '
-        f'{len(frames) - 1}, or a name such as "{sanitize(frames[0].name, 80)}"'
+        f'there is no photo "{sanitize(photo, 80)}" in "{posed.path}": give {parameter("photo")} a number from 0 '
+        f'to {len(frames) - 1}, or a name such as "{sanitize(frames[0].name, 80)}"'
     )
 
 

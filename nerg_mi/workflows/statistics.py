@@ -34,7 +34,7 @@ from nerg_mi.aoi.predicted import (
     what_if_rows,
 )
 from nerg_mi.aoi.scene import read_changes
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.files.atomic import check_folder, make_folder
 from nerg_mi.formats.areas import AreaSet, read_areas
 from nerg_mi.interruption import Interruption
@@ -106,7 +106,7 @@ def _sort(files: Sequence[str | Path | Rays]) -> _InputFiles:
     for file in files:
         path = file if isinstance(file, Rays) else Path(file)
         if not isinstance(path, Rays) and path.suffix.lower() in (".json", ".csv"):
-            raise NergError(f'"{path}" is not rays, a scene or a field; AOIs are given with --aois')
+            raise NergError(f'"{path}" is not rays, a scene or a field; AOIs are given with {parameter("aois")}')
         kind = "rays" if isinstance(path, Rays) else detect_kind(path)
         if kind not in ("scene", "field", "gaze", "rays"):
             raise NergError(f'"{path}" is a {kind}; give rays, a scene (.xml), a gaze field and a radiance field')
@@ -120,7 +120,7 @@ def _sort(files: Sequence[str | Path | Rays]) -> _InputFiles:
 
 def _areas(options: StatisticsOptions) -> AreaSet:
     if options.aois is None:
-        raise NergError("no AOIs are given; add --aois FILE")
+        raise NergError(f"no AOIs are given; add {parameter('aois', 'FILE')}")
     return read_areas(options.aois)
 
 
@@ -142,9 +142,9 @@ class _StatisticsWork:
         for note in self.setting.warnings:
             reporter.message(note)
         if options.what_if is not None and self.around.gaze is None:
-            raise NergError("--what-if needs a gaze field; give one, or a scene that has one")
+            raise NergError(f"{parameter('what_if')} needs a gaze field; give one, or a scene that has one")
         if options.power is not None and inputs.rays is None:
-            raise NergError("--power needs recorded participants; give rays")
+            raise NergError(f"{parameter('power')} needs recorded participants; give rays")
         if options.what_if is not None:
             # Errors in the file are reported before anything is counted.
             read_changes(options.what_if)
@@ -260,7 +260,10 @@ class _StatisticsWork:
     def _in_parts(self, output: str | Path | None) -> PartitionedStatistics:
         g, o = self.inputs, self.options
         if output is None and o.store is None:
-            raise NergError("parts need a folder; name one with --store, or give an output next to which it is created")
+            raise NergError(
+                f"parts need a folder; name one with {parameter('store')}, or give an output next to which it is "
+                "created"
+            )
         import mitsuba as mi
 
         name = Path(output or o.store or "")
@@ -272,7 +275,7 @@ class _StatisticsWork:
         """Return observers without tracking."""
         o = self.options
         if o.observers:
-            return viewpoints_at(np.array([parse_point(text, "--observer") for text in o.observers]))
+            return viewpoints_at(np.array([parse_point(text, parameter("observers")) for text in o.observers]))
         if self.around.observer is not None:
             return viewpoints_at(self.around.observer[None])
         positions = place_observers_on_floor(self.around, o.eye_height, o.grid_step, o.floor_height)

@@ -13,7 +13,7 @@ import numpy as np
 
 from nerg_mi.alignment.check import read_similarity
 from nerg_mi.environment.environment import Environment
-from nerg_mi.errors import NergError, blame_options
+from nerg_mi.errors import NergError, blame_options, parameter
 from nerg_mi.fields.gaze_base import AnyGazeField
 from nerg_mi.files.atomic import check_writable, reserve_output
 from nerg_mi.formats.checkpoint import read_checkpoint
@@ -82,41 +82,54 @@ def _check(options: GazeOptions, recipe: Recipe, views_alone: bool) -> None:
     """Raise `NergError` for contradictory options."""
     kind = geometry_kind(options)
     if views_alone and options.views is None:
-        raise NergError("there is no training data: give a rays file, or --views with --salience, or both")
+        raise NergError(
+            f"there is no training data: give a rays file, or {parameter('views')} with {parameter('salience')}, "
+            "or both"
+        )
     mixed = options.prior_folds or options.prior_kappa is not None or options.reaimed_hits
     if views_alone and (options.test_zones or kind == "hits" or options.align or options.semantic or mixed):
         raise NergError(
-            "--test-zones, --geometry hits, --align, --semantic, --prior-folds, --prior-kappa and --reaimed-hits need "
-            "rays; give a rays file in addition to --views (to hold out views, remove their images from the folder; "
-            "to align views, use --align-views)"
+            f"{parameter('test_zones')}, {parameter('geometry', 'hits')}, {parameter('align')}, "
+            f"{parameter('semantic')}, {parameter('prior_folds')}, {parameter('prior_kappa')} and "
+            f"{parameter('reaimed_hits', True)} need rays; give a rays file in addition to {parameter('views')} "
+            "(to hold out views, remove their images from the folder; to align views, use "
+            f"{parameter('align_views')})"
         )
     if options.geometry is not None and options.align is not None:
-        raise NergError("--align applies to --field and --scene; a geometry of hit points is in the frame of the rays")
+        raise NergError(
+            f"{parameter('align')} applies to {parameter('field')} and {parameter('scene')}; a geometry of hit "
+            "points is in the frame of the rays"
+        )
     if options.test_participants and not options.test_zones:
-        raise NergError("--test-participants needs test positions: add --test-zones")
+        raise NergError(f"{parameter('test_participants')} needs test positions: add {parameter('test_zones')}")
     if (options.views is None or options.salience is None) and (
         options.views or options.salience or options.align_views
     ):
         raise NergError(
-            "--views (posed photos) and --salience (saliency maps, or spectral-residual) must be given together"
+            f"{parameter('views')} (posed photos) and {parameter('salience')} (saliency maps, or "
+            "spectral-residual) must be given together"
         )
     if options.init not in ("random", "field"):
-        raise NergError(f'--init must be "random" or "field", got "{options.init}"')
+        raise NergError(f'{parameter("init")} must be "random" or "field", got "{options.init}"')
     if options.freeze and options.init != "field":
-        raise NergError("--freeze needs --init field; add it, or leave out --freeze")
+        raise NergError(
+            f"{parameter('freeze', True)} needs {parameter('init', 'field')}; add it, or leave out "
+            f"{parameter('freeze', True)}"
+        )
     if options.field is None and (options.semantic or options.init == "field"):
-        raise NergError(f"{'--semantic' if options.semantic else '--init field'} needs a radiance field: add --field")
+        option = parameter("semantic") if options.semantic else parameter("init", "field")
+        raise NergError(f"{option} needs a radiance field: add {parameter('field')}")
     explicit = {
         "activation": options.activation,
         "size": options.size,
         "semantic": options.semantic,
         "init": options.init == "field",
         "loss": options.loss,
-        "integral-weight": options.integral_weight is not None,
+        "integral_weight": options.integral_weight is not None,
         "normalize": options.normalize,
-        "prior-folds": bool(options.prior_folds),
-        "prior-kappa": options.prior_kappa is not None,
-        "reaimed-hits": options.reaimed_hits is not None,
+        "prior_folds": bool(options.prior_folds),
+        "prior_kappa": options.prior_kappa is not None,
+        "reaimed_hits": options.reaimed_hits is not None,
     }
     recipe.check_options([name for name, is_set in explicit.items() if is_set])
     if options.loss and options.loss not in recipe.losses:
@@ -126,7 +139,11 @@ def _check(options: GazeOptions, recipe: Recipe, views_alone: bool) -> None:
 def _architecture_options(options: GazeOptions) -> str:
     """Return the options that determine the architecture, for error messages."""
     uses_field = options.semantic or options.init == "field"
-    return "--semantic, --variant and --init" if uses_field else "--variant and --activation"
+    return (
+        f"{parameter('semantic')}, {parameter('variant')} and {parameter('init')}"
+        if uses_field
+        else f"{parameter('variant')} and {parameter('activation')}"
+    )
 
 
 def _choices(options: GazeOptions, kind: str, views_alone: bool) -> FieldOptions:
@@ -205,10 +222,15 @@ def _train(
     if output is not None and state is not None:
         _check_outputs(options, output, state)
     elif options.resume or (options.geometry == "hits" and volume is None):
-        raise NergError("--resume and --geometry hits need an output file for the gaze field: give one")
+        raise NergError(
+            f"{parameter('resume', True)} and {parameter('geometry', 'hits')} need an output file for the gaze "
+            "field: give one"
+        )
     ns = select_backend(options.mode, options.threads)
     if options.resume and not options.ensemble and (state is None or not state.is_file()):
-        raise NergError(f'there is no state to resume: "{state}" does not exist; leave out --resume to start')
+        raise NergError(
+            f'there is no state to resume: "{state}" does not exist; leave out {parameter("resume", True)} to start'
+        )
     align = Similarity() if options.align is None else _read_alignment(options.align, options.force, reporter)
     if not isinstance(rays, Rays):
         reporter.progress(0.0, "reading rays")
@@ -277,7 +299,7 @@ def train_planned(
 
 def _environment_option(options: GazeOptions) -> str:
     """Return the option that selected the geometry."""
-    return f"--field {options.field}" if options.field is not None else f"--scene {options.scene}"
+    return parameter("field", options.field) if options.field is not None else parameter("scene", options.scene)
 
 
 def _check_outputs(options: GazeOptions, output: Path, state: Path) -> None:
@@ -333,17 +355,17 @@ def _read_alignment(path: Path, force: bool, reporter: Reporter) -> Similarity:
 
     def reject(reason: str) -> None:
         if not force:
-            raise NergError(f"{reason} (or add --force to train anyway)")
+            raise NergError(f"{reason} (or add {parameter('force', True)} to train anyway)")
         reporter.warn(reason)
 
-    return read_similarity(path, "--align", "rays to field", reject)
+    return read_similarity(path, parameter("align"), "rays to field", reject)
 
 
 def _open_views(options: GazeOptions, photos: Path, salience: str) -> tuple[SalienceSet, dict]:
     """Return saliency views in the frame of the scene, and the provenance of their alignment (JSON)."""
     matrix = None
     if options.align_views is not None:
-        matrix = read_similarity(options.align_views, "--align-views", "photos to field").matrix
+        matrix = read_similarity(options.align_views, parameter("align_views"), "photos to field").matrix
     trained = None
     if options.field is not None:
         trained = read_checkpoint(options.field, "radiance")[1].get("provenance")

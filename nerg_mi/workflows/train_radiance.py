@@ -9,7 +9,7 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from nerg_mi.errors import NergError, blame_options
+from nerg_mi.errors import NergError, blame_options, parameter
 from nerg_mi.evaluation.metrics import ViewScores, score_views
 from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.files.atomic import check_folder, check_writable, reserve_output
@@ -116,7 +116,9 @@ def _train(
     ns = select_backend(options.mode, options.threads)
     settings = _settings(options)
     if options.resume and (state is None or not state.is_file()):
-        raise NergError(f'there is no state to resume: "{state}" does not exist; leave out --resume to start')
+        raise NergError(
+            f'there is no state to resume: "{state}" does not exist; leave out {parameter("resume", True)} to start'
+        )
     reporter.progress(0.0, "reading photos")
     data = _open(photos, options)
     _report_data(data, reporter)
@@ -162,7 +164,7 @@ def _settings(options: RadianceOptions) -> RadianceSettings:
 
 
 def _open(photos: str | Path, options: RadianceOptions) -> Dataset:
-    with blame_options("--aabb") if options.aabb else nullcontext():
+    with blame_options(parameter("aabb")) if options.aabb else nullcontext():
         return open_dataset(
             photos,
             options.holdout,
@@ -181,7 +183,10 @@ def _report_data(data: Dataset, reporter: Reporter) -> None:
     corner, core = lambda values: ", ".join(f"{x:.3g}" for x in values), data.box.core
     for line in (*describe_unused(data.unused), *data.notes):
         reporter.message(line)
-    reporter.message(f"assumed scene type: {data.kind_note}; change it with --unbounded, --bounded or --aabb")
+    reporter.message(
+        f"assumed scene type: {data.kind_note}; change it with {parameter('unbounded', True)}, "
+        f"{parameter('bounded')} or {parameter('aabb')}"
+    )
     reporter.message(f"box: ({corner(core.lower)}) to ({corner(core.upper)}), {data.box_source}")
     if points := sum(len(view.points) for view in data.train if view.points is not None):
         reporter.message(f"the COLMAP model has {points:,} observations of points in the training views")
@@ -285,7 +290,8 @@ def evaluate_radiance(
         expected = (time.perf_counter() - start) * len(views)
         if done == 1 and expected > _LONG:
             reporter.message(
-                f"scoring {len(views)} views will take about {expected / 60:.0f} minutes; --views 8 scores 8 of them"
+                f"scoring {len(views)} views will take about {expected / 60:.0f} minutes; {parameter('views', 8)} "
+                "scores 8 of them"
             )
         reporter.progress(done / len(views), f"{done} of {len(views)} views")
 
@@ -297,7 +303,7 @@ def evaluate_radiance(
     if any(map(math.isnan, scores.ssim)):
         reporter.warn(
             f"views of {scores.width} x {scores.height} pixels are smaller than the 11 x 11 window of SSIM; "
-            "increase --width"
+            f"increase {parameter('width')}"
         )
     if scores.depth is not None:
         d = scores.depth
@@ -330,5 +336,5 @@ def _refuse_trained(field: str | Path, provenance: dict, data: Dataset) -> None:
     if seen:
         raise NergError(
             f'"{field}" was trained on {seen[0]} and {len(seen) - 1} other views that would be scored; use the '
-            "same --holdout as in training"
+            f"same {parameter('holdout')} as in training"
         )

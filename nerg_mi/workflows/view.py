@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from nerg_mi.alignment.check import read_similarity
-from nerg_mi.errors import MissingFile, NergError
+from nerg_mi.errors import MissingFile, NergError, parameter
 from nerg_mi.files.atomic import write_text
 from nerg_mi.formats.checkpoint import read_metadata
 from nerg_mi.formats.splats import READERS, is_splat_file
@@ -178,15 +178,19 @@ def _is_complete(path: Path) -> bool:
 
 
 def _explicit_align(options: ViewOptions, reporter: Reporter) -> Similarity | None:
-    return None if options.align is None else read_similarity(options.align, "--align", "rays to place", reporter.warn)
+    return (
+        None
+        if options.align is None
+        else read_similarity(options.align, parameter("align"), "rays to place", reporter.warn)
+    )
 
 
 def _up(options: ViewOptions, otherwise: np.ndarray) -> np.ndarray:
-    up = check_point(options.up, "--up")
+    up = check_point(options.up, parameter("up"))
     up = otherwise if up is None else up
     length = float(np.linalg.norm(up))
     if not length > 0:
-        raise NergError("up must be a direction, three numbers that are not all 0; give --up x,y,z")
+        raise NergError(f"up must be a direction, three numbers that are not all 0; give {parameter('up', 'x,y,z')}")
     return up / length
 
 

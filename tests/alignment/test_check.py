@@ -82,7 +82,7 @@ def test_undetermined_alignments_are_reported_when_they_are_read(tmp_path):
         result.save(path)
         read_similarity(path, "--align", "rays to field", doubts.append)
     (doubt,) = doubts
-    assert str(path) in doubt and "+130" in doubt and "--turn" in doubt
+    assert str(path) in doubt and "+130" in doubt and "turn" in doubt
     stored = json.loads(path.read_text())
     assert stored["uncertainty"] == {
         "level": 0.95,
@@ -112,7 +112,7 @@ def written(path):
 def test_record_is_read_by_every_command(tmp_path):
     path = tmp_path / "alignment.json"
     result = written(path)
-    assert read_similarity(path, "--align", "rays to field").scale == pytest.approx(2)
+    assert read_similarity(path, "align", "rays to field").scale == pytest.approx(2)
     metadata = json.loads(path.read_text())
     assert metadata["evidence"] == {"kind": "pairs", "pairs": 5} and metadata["residuals"]["median_cm"] == 2
     assert metadata["uncertainty"]["cm"] == pytest.approx(100 * np.sqrt(12e-4) / 2)
@@ -126,8 +126,8 @@ def test_record_is_read_by_every_command(tmp_path):
         ({"version": 99}, "version 99"),
         ({"version": True}, "version True"),
         ({"kind": "x"}, "neither that"),
-        ({"matrix": [[1, 2]]}, "--align"),
-        ({"matrix": np.diag([1.0, 2, 1, 1]).tolist()}, "--align"),
+        ({"matrix": [[1, 2]]}, "align"),
+        ({"matrix": np.diag([1.0, 2, 1, 1]).tolist()}, "align"),
     ],
 )
 def test_invalid_files_are_refused(tmp_path, change, why):

@@ -146,7 +146,7 @@ def test_initial_similarity_is_refined():
     "changes, expected, why",
     [
         ({}, {"is_upright": False}, "needs the up direction"),
-        ({}, {"tracking_floor": None}, "give it with --floor-height"),
+        ({}, {"tracking_floor": None}, "give it with floor_height"),
         ({"hit": None}, {}, "do not determine turn and scale"),
         (None, {}, "no gaze samples"),
     ],

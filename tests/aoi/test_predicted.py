@@ -151,7 +151,7 @@ def test_observers_are_placed_on_the_floor(tmp_path):
     result = place_observers_on_floor(around, 1.6, 0.25, 0.0)
     inside = ((result[:, :2] > (2.5, 1.0)) & (result[:, :2] < (2.9, 2.0))).all(axis=1)
     assert 330 < len(result) < 24 * 16 and not inside.any() and np.allclose(result[:, 2], 1.6)
-    with pytest.raises(NergError, match="--floor"):
+    with pytest.raises(NergError, match="floor"):
         place_observers_on_floor(around, 1.6, 0.25, -2.0)
 
 
@@ -267,7 +267,7 @@ def test_few_viewpoints_are_reported():
     assert (
         len(recorder.messages) == 1
         and "1.5 viewpoints per participant" in recorder.messages[0]
-        and "--viewpoints 32 " in recorder.messages[0]
+        and "viewpoints=32 " in recorder.messages[0]
     )
     count = 2 * MIN_VIEWPOINTS
     many = Viewpoints(

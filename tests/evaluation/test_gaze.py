@@ -24,6 +24,7 @@ from nerg_mi.train.gaze_data import hold_out
 from tests.evaluation.gaze_fields import KINDS, made, saved
 from tests.plugins import fields
 from tests.plugins.scenes import camera, channels
+from tests.refusals import mentions
 
 # ---- Cache ----
 
@@ -254,20 +255,20 @@ def test_training_and_test_rays_are_disjoint(rays_evaluation):
         assert named(scored) == (named(train) if split == "pos" else set(account["people"]))
         assert np.linalg.norm(train.origin[:, None] - np.array(account["centres"])[None], axis=2).min() > 0.6
     _, without = hold_out(rays_evaluation, 0.3, zones=2, positions=8, min_rays=8)
-    with pytest.raises(ValueError, match="--test-participants"):
+    with pytest.raises(ValueError, match="test_participants"):
         gaze.select_held_out_rays(rays_evaluation, without, "both")
     with pytest.raises(ValueError, match="both, pos, people"):
         gaze.select_held_out_rays(rays_evaluation, account, "time")
 
 
 def test_positions_without_rays_are_refused(rays_evaluation):
-    with pytest.raises(ValueError, match="--min-rays"):
+    with pytest.raises(ValueError, match="min_rays"):
         gaze.make_test(rays_evaluation, np.array([[40.0, 0, 0]]), 0.5)
 
 
 def test_maps_that_exceed_memory_are_refused(rays_evaluation, monkeypatch):
     monkeypatch.setattr(gaze, "_MAX_BYTES", 1e5)
-    with pytest.raises(NergError, match="--directions"):
+    with pytest.raises(NergError, check=mentions("directions")):
         gaze.make_test(rays_evaluation, np.array([[-0.5, 0, 1.6], [-0.5, 3, 1.6]]), 0.6, 20.0, 512, min_rays=20)
 
 

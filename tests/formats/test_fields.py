@@ -170,7 +170,7 @@ def test_members_have_own_names():
 def test_stored_weights_are_finite():
     values = {"a": ns.Float([1.0, 70000.0])}
     assert to_stored_arrays(values, False)["a"].dtype == np.float32
-    with pytest.raises(NergError, match='"a".*fp16.*--half'):
+    with pytest.raises(NergError, match='"a".*fp16.*half'):
         to_stored_arrays(values, True)
     with pytest.raises(NergError, match='"a" is not finite.*diverged'):
         to_stored_arrays({"a": ns.Float([np.inf])}, False)

@@ -126,7 +126,7 @@ def test04_points_and_the_box():
     with pytest.raises(ValueError, match="does not cross"):
         extract_points(ball, 48, threshold=1e6)
     pytest.importorskip("skimage")
-    with pytest.raises(ValueError, match="does not cross.*--density"):
+    with pytest.raises(ValueError, match="does not cross.*density"):
         extract_mesh(ball, 48, threshold=1e6)
     ball.box = Box((0, 0, 0), (1.2, 2, 1.8))
     assert extract_mesh(ball, 36).report["edges_at_the_box"] > 20

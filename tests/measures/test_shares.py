@@ -21,6 +21,7 @@ from nerg_mi.measures.shares import (
     visible_in_fov,
 )
 from nerg_mi.measures.visits import BoxAoi, assign_hits
+from tests.refusals import mentions
 
 LOW, HIGH = np.array([-2.0, -6.0, 0.0]), np.array([2.0, 6.0, 3.0])
 AHEAD = np.array([0.6, 0.8, 0.0])
@@ -205,7 +206,7 @@ def test_visibility_cache():
     cells.get_visibility(observers[:2])
     again, whose = cells.get_visibility(observers)
     assert np.array_equal(again[whose], points[index]) and len(requested) > before
-    with pytest.raises(NergError, match="--cell"):
+    with pytest.raises(NergError, match="cell"):
         VisibilityCache(targets, depth, 0.0, 0.0)
 
 
@@ -218,7 +219,7 @@ def test_standing_positions():
     low = lambda o, d: np.minimum(room_depth(o, d), np.where((d[:, 2] < 0) & (o[:, 0] < 1), o[:, 2] - 0.5, np.inf))
     assert (find_standing_positions(*ROOM, 0.5, 1.6, low, 0.0)[:, 0] > 1).all()
     assert len(find_standing_positions(*ROOM, 0.5, 1.6, room_depth, -1.0)) == 0
-    with pytest.raises(NergError, match="--grid-step"):
+    with pytest.raises(NergError, check=mentions("grid_step")):
         find_standing_positions(*ROOM, 1e-4, 1.6, room_depth, 0.0)
 
 

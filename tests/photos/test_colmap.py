@@ -364,7 +364,7 @@ def test_images_outside_of_the_capture_are_used_only_if_allowed(tmp_path, write)
     write(model, ["a.png", "../../out/x.png", str(out / "x.png"), "link.png"])
     posed = read_colmap(model, home / "images")
     assert [f.name for f in posed.frames] == ["a.png"] and len(posed.unused) == 3
-    assert all("outside of the data set's folder" in u.reason and "--allow-outside" in u.reason for u in posed.unused)
+    assert all("outside of the data set's folder" in u.reason and "allow_outside" in u.reason for u in posed.unused)
     # All links refer to one file, which counts once.
     assert len(read_colmap(model, home / "images", allow_outside=True).frames) == 2
 

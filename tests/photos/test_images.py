@@ -404,7 +404,7 @@ def test_upright_coordinates_have_up_along_z(ring):
     turn = Rotation.from_euler("xyz", [100, -30, 70], degrees=True).as_matrix()
     rewrite(ring, lambda c: tilt(c, turn))
     tipped = open_dataset(ring, holdout=0)
-    assert "--coordinates upright" in tipped.up_note and "degrees from +z" in tipped.up_note
+    assert "upright" in tipped.up_note and "degrees from +z" in tipped.up_note
     assert np.allclose(tipped.source["up"], turn[:, 2], atol=0.02)
     data = open_dataset(ring, holdout=0, coordinates="upright")
     assert data.up_note.startswith("up is +z to 0.0") and np.allclose(data.source["up"], [0, 0, 1], atol=1e-5)

@@ -173,7 +173,7 @@ def test_links_out_of_the_folder_are_followed_only_if_allowed(folder, folders, t
     (folder / "c.jpg").symlink_to("a.jpg")
     pictures, unused = copy_all(folder, folders)
     assert [p.name for p in pictures] == ["a.jpg"] and "same file" in unused["c.jpg"]
-    assert "outside of" in unused["b.jpg"] and "--allow-outside" in unused["b.jpg"]
+    assert "outside of" in unused["b.jpg"] and "allow_outside" in unused["b.jpg"]
     names, _ = copy_photos(list_photos(folder)[0], folders, 24, lambda *now: None, allow_outside=True)
     assert [p.name for p in names] == ["a.jpg", "b.jpg"]
 

@@ -365,7 +365,7 @@ def test_files_outside_of_the_folder_are_used_only_if_allowed(tmp_path, keys):
     )
     t = read_transforms(home / "transforms.json")
     assert [f.name for f in t.frames] == ["b.png"]
-    assert "outside of the data set's folder" in t.unused[0].reason and "--allow-outside" in t.unused[0].reason
+    assert "outside of the data set's folder" in t.unused[0].reason and "allow_outside" in t.unused[0].reason
     assert len(read_transforms(home / "transforms.json", allow_outside=True).frames) == 2
 
 

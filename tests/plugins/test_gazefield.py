@@ -453,7 +453,7 @@ def test06_unrequested_views_are_not_traced(rgb, files, ensemble):
 
 
 @pytest.mark.parametrize(
-    "aov, said", [("gaze_std", "ensemble.*train one with --ensemble"), ("support", "with support; train it again")]
+    "aov, said", [("gaze_std", "ensemble.*train one with ensemble"), ("support", "with support; train it again")]
 )
 def test07_missing_dependencies_are_reported(rgb, files, aov, said):
     with pytest.raises(RuntimeError, match=said):

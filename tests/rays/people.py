@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from nerg_mi.errors import clean_text
 from nerg_mi.rays.quality import summarise
 from nerg_mi.rays.rays import FRAME, Rays
 from nerg_mi.rays.readers.base import TrackingFrame
@@ -25,7 +26,7 @@ def walk(hit=True, frame=None, seed=0):
 
 
 def warnings_of(rays):
-    return " | ".join(summarise(rays).warnings)
+    return clean_text(" | ".join(summarise(rays).warnings))
 
 
 def watch(people=3, n=3000, seed=0):

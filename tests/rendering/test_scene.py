@@ -303,7 +303,7 @@ def test_spp_option_is_bounded(tmp_path):
     from nerg_mi.workflows.render import render_file
     from nerg_mi.workflows.scene_commands import PictureOptions
 
-    with pytest.raises(NergError, match="--spp.*0.*16777216"):
+    with pytest.raises(NergError, match="spp.*0.*16777216"):
         render_file(tmp_path / "s.xml", tmp_path / "a.exr", PictureOptions(spp=1 << 31))
 
 

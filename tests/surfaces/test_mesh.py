@@ -81,7 +81,7 @@ def test_fine_mesh_is_unchanged():
 
 def test_too_many_faces_are_refused(monkeypatch):
     monkeypatch.setattr(mesh, "MAX_REFINED_FACES", 1000)
-    with pytest.raises(NergError, match="larger --max-edge"):
+    with pytest.raises(NergError, match="larger max_edge"):
         refine(joined(box((0, 0, 0), (1, 1, 1))), 0.01)
 
 
@@ -152,7 +152,7 @@ def test_oversized_textures_are_refused(rgb, monkeypatch):
     pytest.importorskip("xatlas", reason="xatlas is not installed")
     cube = joined(box((0, 0, 0), (1, 1, 1)))
     monkeypatch.setattr(mesh, "MAX_CHART_FACES", 4)
-    with pytest.raises(NergError, match="omit --texture-size"):
+    with pytest.raises(NergError, match="omit texture_size"):
         unwrap_uv(cube, 64)
 
 

@@ -281,7 +281,7 @@ def test_subdivision_ends_for_overflowing_distances(far):
 
 def test_too_many_pieces_are_refused(monkeypatch):
     monkeypatch.setattr("nerg_mi.surfaces.sources.MAX_PIECES", 1000)
-    with pytest.raises(NergError, match="1,000.*--max-angle"):
+    with pytest.raises(NergError, match="1,000.*max_angle"):
         subdivide_faces(PIECES_ROOM, np.full(3, 0.5), 0.02)
 
 

@@ -163,7 +163,7 @@ def test_surface_points_lie_at_the_depth_of_their_rays():
 
 def test_too_many_pixels_are_refused(monkeypatch):
     monkeypatch.setattr("nerg_mi.train.radiance_data._MAX_PIXELS", 100)
-    with pytest.raises(ValueError, match="smaller --width"):
+    with pytest.raises(ValueError, match="smaller width"):
         PixelBank(ns, [view(PLAIN, np.random.default_rng(5))])
 
 

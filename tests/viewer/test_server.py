@@ -252,7 +252,7 @@ def test15_share_url_is_disabled(local, monkeypatch):
 
 
 def test16_used_port_is_reported(local):
-    with pytest.raises(NergError, match="choose another with --port"):
+    with pytest.raises(NergError, match="choose another with port"):
         start_server(RequestGuard("127.0.0.1"), local.get_port(), "test")
 
 

@@ -273,7 +273,7 @@ def test09_missing_viser_and_a_used_port_are_refused_before_the_training(tmp_pat
     require("viser")
     with open_training_page(0) as page:
         port = page.server.get_port()
-        with pytest.raises(NergError, match="choose another with --port"):
+        with pytest.raises(NergError, match="choose another with port"):
             train_radiance(tmp_path, None, RadianceOptions(**{**OPTIONS, "port": port}))
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(NergError, match=r'pip install "nerg-mi\[viewer\]"'):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from nerg_mi.errors import clean_text
+
 
 class Recorder:
     def __init__(self):
@@ -10,13 +12,13 @@ class Recorder:
         self.steps: list[tuple[float, str]] = []
 
     def message(self, text: str) -> None:
-        self.messages.append(text)
+        self.messages.append(clean_text(text))
 
     def warn(self, text: str) -> None:
-        self.warnings.append(text)
+        self.warnings.append(clean_text(text))
 
     def progress(self, share: float, text: str = "") -> None:
-        self.steps.append((share, text))
+        self.steps.append((share, clean_text(text)))
 
     def share_at(self, text: str) -> float:
         """Return the last progress fraction reported with ``text``."""

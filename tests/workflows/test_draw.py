@@ -100,7 +100,7 @@ def test_differences_that_cannot_be_drawn_are_refused(tmp_path):
         ([a], {}, "a difference needs two images, got"),
         ([a, tmp_path / "b.exr"], {}, "8 x 6 and 4 x 3 pixels cannot be compared"),
         ([a, a], {"cmap": "viridis"}, "not a diverging colour map"),
-        ([a, a], {"top": -1.0}, "--vmax must lie in"),
+        ([a, a], {"top": -1.0}, "vmax must lie in"),
         ([a, a, a], {}, "takes 1 to 2 files, got 3"),
     ):
         with pytest.raises(NergError, match=said):
@@ -231,10 +231,10 @@ def test_surfaces_that_cannot_be_drawn_are_refused(tmp_path):
         (tmp_path / "bare.ply", {}, "give a .ply file that"),
         (tmp_path / "odd.ply", {}, "odd.ply"),
         (damaged, {}, "is damaged"),
-        (good, {"below": -1.0}, "--clip-above"),
+        (good, {"below": -1.0}, "clip_above"),
         (good, {"camera": (0.0, 0, 2), "target": (0.0, 0, 5)}, "is in the image"),
-        (good, {"camera": (0.0, 0, 2), "target": (0.0, 0, 2)}, "from --camera to --target must not be"),
-        (good, {"up": (0.0, 0, 0)}, "--up must not be of length 0"),
+        (good, {"camera": (0.0, 0, 2), "target": (0.0, 0, 2)}, "from camera to target must not be"),
+        (good, {"up": (0.0, 0, 0)}, "up must not be of length 0"),
     ):
         with pytest.raises(NergError, match=said):
             draw("surface", path, mode="llvm_ad_rgb", width=32, height=32, **options)
@@ -252,8 +252,8 @@ def test_splats_are_drawn_with_their_gaze(tmp_path):
 def test_wrong_scale_options_are_refused():
     assert ScaleOptions(cmap="viridis", log_decades=3, hatching=False).style("a") == Style("viridis", 3, False, "a")
     for options, said in (
-        ({"top": 0.0}, "--vmax must lie in"),
-        ({"decades": -1}, "--log-decades"),
+        ({"top": 0.0}, "vmax must lie in"),
+        ({"decades": -1}, "log_decades"),
         ({"cmap": "jet"}, '"jet" is no'),
     ):
         with pytest.raises(NergError, match=said):
@@ -432,11 +432,7 @@ def test_fixations_are_numbered_where_they_are(rgb, tmp_path):
     magnification = np.ptp(axes.get_xlim()) / 60
     assert magnification == 1 and np.allclose([t.xy for t in axes.texts[:2]], expected, atol=0.05)
     assert "1 outside of the image or hidden" in " ".join(axes.figure.texts[0].get_text().split())
-    for refused, said in (
-        (dict(participants="Eve"), "Eve"),
-        (dict(start=9.0), "--start"),
-        (dict(scene=None), "--scene"),
-    ):
+    for refused, said in ((dict(participants="Eve"), "Eve"), (dict(start=9.0), "start"), (dict(scene=None), "--scene")):
         with pytest.raises(NergError, match=said):
             draw("scanpath", tmp_path / "rays.npz", **(options | refused))
 
@@ -525,7 +521,7 @@ def test_a_floor_plan_is_drawn_over_geometry(rgb, rays, tmp_path):
     assert "scene.xml" in text and "rays.npz" in text and str(tmp_path) not in text
 
 
-@pytest.mark.parametrize("options, said", [({"people": "Eve"}, "Eve"), ({"cut": 0.0}, "--cut-height must be above")])
+@pytest.mark.parametrize("options, said", [({"people": "Eve"}, "Eve"), ({"cut": 0.0}, "cut_height must be above")])
 def test_wrong_options_of_a_floor_plan_are_refused(rays, options, said):
     with pytest.raises(NergError, match=said):
         draw("floor", rays, **options)

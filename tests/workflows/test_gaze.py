@@ -36,6 +36,7 @@ from nerg_mi.workflows.train_gaze import learn_prior, train_gaze
 from tests.evaluation.test_gaze import crowd
 from tests.notes import find_wrong_notes
 from tests.plugins import fields
+from tests.refusals import mentions
 from tests.tasks.clusters import ClusterOfProcesses, wait_until
 from tests.train.gaze.looks import BOX, around, looking_at
 from tests.workflows.recorder import Recorder
@@ -91,7 +92,7 @@ def test_unusable_inputs_are_refused(trained, tmp_path):
     crowd(2000).save(tmp_path / "rays.npz")
     with pytest.raises(NergError, match=r"give the unchanged file rays.npz"):
         evaluate_gaze(gaze, tmp_path / "rays.npz", options=OPTIONS)
-    with pytest.raises(NergError, match="--test-participants"):
+    with pytest.raises(NergError, check=mentions("test_participants")):
         evaluate_gaze(gaze, trained / "rays.npz", options=replace(OPTIONS, split="both"))
     train_gaze(crowd(1000), tmp_path / "gaze.safetensors", replace(TRAINING, test_zones=0))
     with pytest.raises(NergError, match="trained on all positions"):
@@ -145,7 +146,7 @@ def test_the_next_look_is_fitted_and_scored(tmp_path, rgb, monkeypatch):
     np.testing.assert_allclose(
         scaled(rays.origin / 2, rays.direction), distance(rays.origin, rays.direction) / 2, rtol=1e-4
     )
-    with pytest.raises(NergError, match="--elapsed"):
+    with pytest.raises(NergError, check=mentions("elapsed")):
         evaluate_next_look(gaze, rays, None, replace(options, elapsed=(3.0, 1.0)))
     with pytest.raises(NergError, match="0.001 s before"):
         evaluate_next_look(gaze, rays, None, replace(options, elapsed=(0.001,)))
@@ -157,14 +158,14 @@ def test_the_next_look_is_fitted_and_scored(tmp_path, rgb, monkeypatch):
     assert result.model.gaze_in_head == pytest.approx(np.array([1.0, 0, 0]), abs=1e-6)
     # Gaze is the direction of the head.
     assert result.rows[0]["bits"] > 3
-    with pytest.raises(NergError, match="--elapsed"):
+    with pytest.raises(NergError, check=mentions("elapsed")):
         evaluate_next_look(gaze, heads, None, replace(head_options, elapsed=(1.0,)))
     with pytest.raises(NergError, match="heads"):
         evaluate_next_look(gaze, rays, None, head_options)
 
 
 def test_the_next_look_needs_held_out_participants(trained):
-    with pytest.raises(NergError, match="--test-participants"):
+    with pytest.raises(NergError, check=mentions("test_participants")):
         evaluate_next_look(trained / "gaze.safetensors", trained / "rays.npz")
 
 
@@ -287,7 +288,7 @@ def test_missing_values_of_folds_have_a_reason(tmp_path, monkeypatch):
 
 
 def test_wrong_fold_options_are_refused(tmp_path):
-    with pytest.raises(NergError, match="--splits"):
+    with pytest.raises(NergError, check=mentions("splits")):
         evaluate_folds(crowd(300), tmp_path / "out", FoldOptions(**SMALL | {"splits": "both,time"}))
     with pytest.raises(NergError, match="give the geometry that the participants saw:"):
         evaluate_folds(crowd(300), tmp_path / "out", FoldOptions(**SMALL | {"geometry": None}))
@@ -403,10 +404,10 @@ def test_geometry_is_located_next_to_its_checkpoint(rays, tmp_path, kind):
         return
     option = {"field": "field", "scene": "scene", "hits": "geometry"}[kind]
     elsewhere = {"choice" if kind == "hits" else kind: tmp_path / "other"}
-    with pytest.raises(NergError, match=f"does not exist; name it with --{option}"):
+    with pytest.raises(NergError, match=f"does not exist; name it with {option}"):
         load_training_geometry(tmp_path / "gaze.safetensors", provenance, BOX, ns, **elsewhere)
     (tmp_path / "other").write_bytes(b"something else")
-    with pytest.raises(NergError, match=f"is not the file .*--{option}"):
+    with pytest.raises(NergError, match=f"is not the file .*{option}"):
         load_training_geometry(tmp_path / "gaze.safetensors", provenance, BOX, ns, **elsewhere)
 
 
@@ -418,9 +419,9 @@ def test_an_evaluation_takes_the_words_of_its_training(rays, tmp_path, kind, wor
         again = load_training_geometry(gaze, provenance, BOX, ns, choice=word)
         assert again.kind == kind
     else:
-        with pytest.raises(NergError, match="--geometry") as refusal:
+        with pytest.raises(NergError, check=mentions("geometry")) as refusal:
             load_training_geometry(gaze, provenance, BOX, ns, choice=word)
-        trained = {"scene": "--scene", "hits": "--geometry hits", "none": "--geometry none"}[kind]
+        trained = {"scene": "scene", "hits": 'geometry="hits"', "none": 'geometry="none"'}[kind]
         assert f'"{word}"' in str(refusal.value) and trained in str(refusal.value)
         assert "does not exist" not in str(refusal.value)
 
@@ -443,8 +444,8 @@ def test_without_geometry_the_box_contains_all_observers(rays):
 def test_an_alignment_file_contains_a_similarity(tmp_path):
     path = tmp_path / "align.json"
     path.write_text(json.dumps(np.diag([3.0, 3, 3, 1]).tolist()))
-    assert read_similarity(path, "--align", "rays to field").scale == pytest.approx(3)
+    assert read_similarity(path, "align", "rays to field").scale == pytest.approx(3)
     for wrong in ("[1, 2]", '{"a": 1}', json.dumps(np.diag([3.0, 2, 3, 1]).tolist())):
         path.write_text(wrong)
-        with pytest.raises(NergError, match=r"--align-views.*align\.json"):
-            read_similarity(path, "--align-views", "photos to field")
+        with pytest.raises(NergError, match=r"align_views.*align\.json"):
+            read_similarity(path, "align_views", "photos to field")

@@ -113,7 +113,7 @@ def test_an_interrupted_training_without_an_output_has_a_result(cube):
 
 def test_an_interrupted_training_with_an_output_can_be_resumed(cube):
     out = cube / "a.safetensors"
-    with pytest.raises(KeyboardInterrupt, match="--resume"):
+    with pytest.raises(KeyboardInterrupt, match="resume"):
         train_radiance(cube, out, RadianceOptions(steps=2, holdout=3), Impatient())
     assert out.is_file() and out.with_suffix(".run").is_file()
     result = train_radiance(cube, out, RadianceOptions(steps=2, holdout=3, resume=True))
@@ -122,7 +122,7 @@ def test_an_interrupted_training_with_an_output_can_be_resumed(cube):
 
 
 def test_resuming_without_an_output_is_refused(cube):
-    with pytest.raises(NergError, match="does not exist; leave out --resume to start"):
+    with pytest.raises(NergError, match="does not exist; leave out resume=True to start"):
         train_radiance(cube, options=RadianceOptions(steps=2, resume=True))
 
 
@@ -163,7 +163,7 @@ def test_import_without_an_output_returns_fields(torch, tmp_path):
     result = import_checkpoint(path, reporter=recorder)
     assert result.field is not None and result.gaze.config.variant == "emit_capture" and result.files == []
     assert [p.name for p in tmp_path.iterdir()] == ["nerg.pth"]
-    assert recorder.messages == [f'"{path}" also contains a gaze field: write it with --gaze NAME.safetensors']
+    assert recorder.messages == [f'"{path}" also contains a gaze field: write it with gaze=NAME.safetensors']
 
 
 def test_import_returns_files_in_order(torch, tmp_path):
@@ -392,7 +392,7 @@ def test_an_uncertain_or_disabled_up_direction_is_reported(photos, finds, tmp_pa
     recorder = Recorder()
     finds(COUNT, lambda made: replace(made, up=UpEstimate(np.array([0, 0, 1.0]), 40.0)))
     find_poses(photos, tmp_path / "a", None, recorder)
-    assert "disagree on the up direction" in recorder.warnings[0] and "--no-orient" in recorder.warnings[0]
+    assert "disagree on the up direction" in recorder.warnings[0] and "orient=False" in recorder.warnings[0]
     finds(COUNT, lambda made: replace(made, up=None))
     result = find_poses(photos, tmp_path / "b", PoseOptions(orient=False), recorder)
     assert "the up direction was not estimated" in recorder.messages and result.report["up"] is None

@@ -95,7 +95,7 @@ def test_slow_samples_are_reported(looks):
     slow = some_rays(20, t=0.5 * np.arange(20))
     slow, reporter = slow.with_tracking("eye"), Recorder()
     assert set(measure_events(slow, reporter=reporter).events.count()) == {"blink"}
-    assert any("--max-step" in warning for warning in reporter.warnings)
+    assert any("max_step" in warning for warning in reporter.warnings)
     reporter = Recorder()
     assert set(measure_events(slow, RaysEventsOptions(max_step=1.0), reporter).events.count()) == {"fixation"}
     assert not reporter.warnings

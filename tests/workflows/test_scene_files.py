@@ -42,6 +42,7 @@ from nerg_mi.workflows.scene_environments import (
     write_scene_geometry,
 )
 from tests.formats.splats.writers import random_splats, write_inria
+from tests.refusals import mentions
 from tests.workflows.recorder import Recorder
 
 # ---- Panoramas from which a camera is chosen: directions, depths and bounds of a known room ----
@@ -85,7 +86,7 @@ def test_observers_inside_matter_face_a_positive_distance(depths, length):
 
 
 def test_points_and_up_axes():
-    assert check_point(None, "--to") is None and check_point((1, 2, 3), "--to").tolist() == [1, 2, 3]
+    assert check_point(None, "target") is None and check_point((1, 2, 3), "target").tolist() == [1, 2, 3]
     with pytest.raises(NergError, match="--to must be three numbers x,y,z, got"):
         check_point((1.0, 2.0), "--to")
     up = np.array([0.0, 0, 1])
@@ -94,7 +95,7 @@ def test_points_and_up_axes():
     assert abs(down.up @ up) < 1e-9
     far = make_upright(LookAt(np.array([-1e7, 0, 1e7]), np.array([-1e7, 1.0, 1e7])), up)
     assert np.allclose(np.float32(far.target) - np.float32(far.origin), [0, 1000, 0])
-    with pytest.raises(NergError, match="--target"):
+    with pytest.raises(NergError, check=mentions("target")):
         make_upright(LookAt(np.ones(3), np.ones(3)), up)
 
 
@@ -153,7 +154,7 @@ def test_the_nearest_ray_of_a_person(rays):
     [
         ("Eve", 0, "Eve"),
         ("Cy", 0, "has no rays; choose another person"),
-        ("Ada", 5.0, "s; increase --max-gap to bridge longer pauses"),
+        ("Ada", 5.0, "s; increase max_gap to bridge longer pauses"),
     ],
 )
 def test_a_time_without_participants_is_refused(rays, person, time, said):
@@ -266,7 +267,7 @@ def test_the_geometry_of_a_gaze_field_is_next_to_it(folder):
 @pytest.mark.parametrize("geometry", ["hits", "none"])
 @pytest.mark.parametrize("gaze", ["gaze", "nowhere"])
 def test_a_gaze_field_is_not_shown_in_another_geometry(folder, gaze, geometry):
-    with pytest.raises(NergError, match=f'^--geometry .*"{folder}/{gaze}.safetensors" is shown .* leave it out$'):
+    with pytest.raises(NergError, match=f'^geometry .*"{folder}/{gaze}.safetensors" is shown .* leave it out$'):
         recognise([folder / f"{gaze}.safetensors", folder / "hits.npz"], geometry, Recorder())
 
 
@@ -335,10 +336,10 @@ def test_photo_cameras_are_in_training_coordinates(photos):
 
 
 def test_photos_without_a_pose_are_refused(photos):
-    with pytest.raises(NergError, match="give the photos of its training with --photos"):
+    with pytest.raises(NergError, match="give the photos of its training with photos"):
         load_photo_camera(photos, "0", {"sha256": "0" * 64})
     for photo in ("3", "p9", "-1"):
-        with pytest.raises(NergError, match='--photo.*0.*2.*"p0.png"'):
+        with pytest.raises(NergError, match='photo.*0.*2.*"p0.png"'):
             load_photo_camera(photos, photo, {})
 
 

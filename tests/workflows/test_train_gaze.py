@@ -189,7 +189,7 @@ def test_a_registered_recipe_trains_from_function_and_command(rays, tmp_path, mo
     assert code == 0, said
     field, meta = load_gaze(out, ns)
     assert field.config.escaped == "nearest" and len(meta["provenance"]["test"]["centres"]) == 4
-    with pytest.raises(NergError, match="the recipe coarse does not support --loss; add"):
+    with pytest.raises(NergError, match="the recipe coarse does not support loss; add"):
         check_plan(GazeOptions(geometry="none", recipe="coarse", loss="paper"))
 
 
@@ -213,7 +213,7 @@ def test_an_interrupted_training_stops_the_script_and_reports_how_to_resume(rays
     assert end.value.provenance["steps"] == 4 and end.value.provenance["interrupted"]
     assert arrays(end.value.field)
     out = tmp_path / "gaze.safetensors"
-    with pytest.raises(KeyboardInterrupt, match="interrupted; continue with --resume"):
+    with pytest.raises(KeyboardInterrupt, match="interrupted; continue with resume"):
         train_gaze(rays, out, options, Listener(0.5))
     assert {p.name for p in tmp_path.iterdir()} == {"gaze.safetensors", "gaze.run"}
     field, meta = load_gaze(out, ns)
@@ -252,7 +252,7 @@ def test_the_command_resumes_a_training(tmp_path, monkeypatch, capsys):
         code, _, said = nerg(capsys, *line)
     assert (
         code == 130
-        and "interrupted; continue with --resume" in said
+        and "interrupted; continue with resume" in said
         and out.is_file()
         and out.with_suffix(".run").is_file()
     )
@@ -277,7 +277,7 @@ def test_an_ensemble_is_one_option(tmp_path):
 
 
 def test_hit_point_geometry_needs_a_file(rays):
-    with pytest.raises(NergError, match="--resume and --geometry hits need an output"):
+    with pytest.raises(NergError, match='resume=True and geometry="hits" need an output'):
         train_gaze(rays, options=replace(QUICK, geometry="hits"))
 
 
@@ -302,23 +302,23 @@ SCENE = Environment(None, BOX, "scene")
 @pytest.mark.parametrize(
     "options, alone, said",
     [
-        (GazeOptions(), False, "--field FILE.*--scene FILE.*--geometry"),
-        (replace(HITS, scene=Path("a.xml")), False, "one of --field FILE"),
+        (GazeOptions(), False, "field=FILE.*scene=FILE.*geometry"),
+        (replace(HITS, scene=Path("a.xml")), False, "one of field=FILE"),
         (GazeOptions(geometry="hit"), False, '"hits".*"none".*"hit"'),
         (GazeOptions(geometry="none"), True, "there is no training data: give a rays file, or"),
-        (replace(VIEWS, geometry="hits"), True, "--test-zones, --geometry hits, --align,"),
-        (replace(VIEWS, mix_kappa=20.0), True, "--test-zones, --geometry hits, --align,"),
-        (replace(VIEWS, mix_folds=2), True, "--test-zones, --geometry hits, --align,"),
-        (replace(VIEWS, test_zones=1), True, "--test-zones, --geometry hits, --align,"),
+        (replace(VIEWS, geometry="hits"), True, 'test_zones, geometry="hits", align,'),
+        (replace(VIEWS, mix_kappa=20.0), True, 'test_zones, geometry="hits", align,'),
+        (replace(VIEWS, mix_folds=2), True, 'test_zones, geometry="hits", align,'),
+        (replace(VIEWS, test_zones=1), True, 'test_zones, geometry="hits", align,'),
         (replace(VIEWS, salience=None), False, "saliency maps, or spectral-residual"),
         (replace(HITS, align_views=Path("a.json")), False, "saliency maps, or spectral-residual"),
-        (replace(HITS, align=Path("a.json")), False, "--align.*--field.*--scene"),
-        (replace(HITS, test_participants=0.5), False, "--test-participants needs test positions: add"),
+        (replace(HITS, align=Path("a.json")), False, "align.*field.*scene"),
+        (replace(HITS, test_participants=0.5), False, "test_participants needs test positions: add"),
         (replace(FIELD, init="nerf"), False, '"random".*"field"'),
-        (replace(FIELD, freeze=True), False, "--freeze"),
-        (replace(HITS, recipe="small", init="field"), False, "--init field needs a radiance field: add --field"),
-        (replace(HITS, recipe="small", semantic="snapshot"), False, "--semantic"),
-        (replace(HITS, loss="paper"), False, "add --recipe small"),
+        (replace(FIELD, freeze=True), False, "freeze"),
+        (replace(HITS, recipe="small", init="field"), False, 'init="field" needs a radiance field: add field'),
+        (replace(HITS, recipe="small", semantic="snapshot"), False, "semantic"),
+        (replace(HITS, loss="paper"), False, 'add recipe="small"'),
         (replace(HITS, integral=1.0), False, "the recipe default does not support"),
         (replace(HITS, recipe="small", mix_kappa=20.0), False, "the recipe small does not support"),
         (replace(HITS, recipe="small", mix_folds=2), False, "the recipe small does not support"),
@@ -326,7 +326,7 @@ SCENE = Environment(None, BOX, "scene")
         (replace(HITS, activation="exp"), False, "the recipe default does not support"),
         (replace(FIELD, loss="likelihood"), False, '"likelihood"'),
         (replace(HITS, recipe="large"), False, "one of default, small, paper"),
-        (replace(HITS, variant="both"), False, "--variant.*--activation"),
+        (replace(HITS, variant="both"), False, "variant.*activation"),
         (replace(FIELD, semantic="glance"), False, "of a gaze field must be one of accumulated,"),
         (GazeOptions(geometry="none", recipe="small"), False, "needs surfaces"),
     ],

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.errors import NergError, sanitize
+from nerg_mi.errors import NergError, parameter, sanitize
 from nerg_mi.files.safe_read import BadLineCallback, resolve_path
 
 from . import poses
@@ -127,7 +127,8 @@ def resolve_device(requested: str | None, generation: int) -> str:
     if name not in models:
         what = "is of another generation than the gaze file" if name in _MODELS else "is not a model of Aria glasses"
         raise NergError(
-            f'--device "{sanitize(requested, 40)}" {what}; choose one of {", ".join(models)}, or leave it out'
+            f'{parameter("device")} "{sanitize(requested, 40)}" {what}; choose one of {", ".join(models)}, or '
+            "leave it out"
         )
     return name
 
@@ -264,7 +265,7 @@ _GENERAL = ("general_eye_gaze", "generalized_eye_gaze", "generalized_gaze", "eye
 _TRAJECTORIES = ("closed_loop_trajectory", "aria_trajectory")
 _GAZE_FOLDERS = ("eye_gaze", "eye_gaze_vergence", ".")
 _POSE_FOLDERS = (".", "slam", "trajectory", "../slam", "../trajectory", "..")
-_OTHER_WORLD = "the pose is in another world, by its graph_uid (option --world)"
+_OTHER_WORLD = "the pose is in another world, by its graph_uid (option world)"
 _MAX_LISTED_WORLDS = 20
 
 
@@ -374,16 +375,17 @@ def _choose_world(recordings: Sequence[_Recording], requested: str | None) -> st
     if requested is not None:
         if requested not in rows and not any(requested in r.trajectory.tracks for r in recordings):
             raise NergError(
-                f'there is no world "{sanitize(requested, 40)}" (--world) in these recordings; there are {worlds_text}'
+                f'there is no world "{sanitize(requested, 40)}" ({parameter("world")}) in these recordings; there '
+                f"are {worlds_text}"
             )
         return requested
     world = min((w for r in recordings for w in r.trajectory.tracks), key=lambda w: (-rows[w], w))
     for recording in recordings:
         if world not in recording.trajectory.tracks:
             raise NergError(
-                f"{recording.gaze} was recorded in another world (graph_uid) than {sanitize(world, 40)}, each with a "
-                f"frame of its own ({worlds_text}); import them separately, combine them with MPS (Multi-SLAM), or "
-                "choose one with --world"
+                f"{recording.gaze} was recorded in another world (graph_uid) than {sanitize(world, 40)}, each with "
+                f"a frame of its own ({worlds_text}); import them separately, combine them with MPS (Multi-SLAM), "
+                f"or choose one with {parameter('world')}"
             )
     return world
 

@@ -15,7 +15,7 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from nerg_mi.errors import NergError, sanitize
+from nerg_mi.errors import NergError, clean_text, parameter, sanitize
 from nerg_mi.files.atomic import file_sha256
 from nerg_mi.files.safe_read import BadLineCallback, check_regular_file
 from nerg_mi.files.values import normalize_name, to_name
@@ -170,8 +170,8 @@ class RaysBuilder:
     def add_warning(self, sentence: str) -> None:
         """Add a warning with the likely mistake in the files and the remedy, for the quality report."""
         warnings = self._metadata.setdefault("complaints", [])
-        if sentence not in warnings:
-            warnings.append(sentence)
+        if (text := clean_text(sentence)) not in warnings:
+            warnings.append(text)
 
     def read_table(
         self,
@@ -200,8 +200,8 @@ class RaysBuilder:
             unit = parse_time_unit(name)
             if unit is not None and not math.isclose(unit, tick):
                 self.add_warning(
-                    f"{sanitize(name, 40)!r} is in units of {unit:g} s by its name, but was read in units of {tick:g} "
-                    f"s: set --tick {unit:g}, unless the name is wrong"
+                    f"{sanitize(name, 40)!r} is in units of {unit:g} s by its name, but was read in units of "
+                    f"{tick:g} s: set {parameter('tick', f'{unit:g}')}, unless the name is wrong"
                 )
         settings = {"first_line": first_line, "separator": separator, "clocks": clocks, "on_note": self.add_metadata}
         return iterate_table(path, numbers, texts, header, self.on_bad_line, **settings)
@@ -239,11 +239,12 @@ class RaysBuilder:
         if bad > max(1, MAX_BAD_LINE_FRACTION * lines):
             raise NergError(
                 f"{self._sources[-1]['file']}: {bad:,} of {lines:,} lines are unreadable, more than the maximum of "
-                f"{100 * MAX_BAD_LINE_FRACTION:g} % for --skip-bad-lines (the first is {self._first_bad_line})"
+                f"{100 * MAX_BAD_LINE_FRACTION:g} % for {parameter('skip_bad_lines', True)} (the first is "
+                f"{self._first_bad_line})"
             )
         if bad:
             self._record_dropped(
-                "the line is incomplete, has too many cells, or a cell that is not a number (option --skip-bad-lines)",
+                "the line is incomplete, has too many cells, or a cell that is not a number (option skip_bad_lines)",
                 np.array(self._bad_lines),
             )
             self._rows_read += bad
@@ -438,8 +439,8 @@ class RaysBuilder:
         if unused_validity:
             suffix = f" and {len(unused_validity) - 3} more" if len(unused_validity) > 3 else ""
             self.add_warning(
-                f"{', '.join(map(repr, unused_validity[:3]))}{suffix} may mark valid rows by their names, but are not "
-                "used; use it with --map and --valid"
+                f"{', '.join(map(repr, unused_validity[:3]))}{suffix} may mark valid rows by their names, but are "
+                f"not used; use it with {parameter('columns')} and {parameter('valid')}"
             )
         for sentence in self._head_frames.describe():
             self.add_warning(sentence)

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError, sanitize
+from nerg_mi.errors import NergError, parameter, sanitize
 from nerg_mi.files.safe_read import read_json, resolve_path
 from nerg_mi.maths.transforms import check_rigid_transforms
 from nerg_mi.ranges import TIME_UNITS, ValidatedDataclass
@@ -81,7 +81,9 @@ class BidsOptions(ValidatedDataclass):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.eye not in (None, *_EYES):
-            raise NergError(f'--eye is "{sanitize(str(self.eye), 40)}"; it must be cyclopean, both, left or right')
+            raise NergError(
+                f'{parameter("eye")} is "{sanitize(str(self.eye), 40)}"; it must be cyclopean, both, left or right'
+            )
         if self.forward is not None:
             poses.parse_axis(self.forward, "forward")
 
@@ -273,7 +275,7 @@ class _Gaze:
         if options.tick is None and units.lower() not in _TICKS:
             raise NergError(
                 f'the JSON files of "{self.path}" state no unit of its {TIME} ("Units" is '
-                f'"{sanitize(units, 40)}"); add s, ms, us or ns, or set it (--tick)'
+                f'"{sanitize(units, 40)}"); add s, ms, us or ns, or set it ({parameter("tick")})'
             )
         return _TICKS[units.lower()] if options.tick is None else options.tick
 
@@ -316,7 +318,9 @@ def _choose_eyes(eyes: Sequence[_Gaze], requested: str | None) -> tuple[_Gaze, .
     if requested is None and len(eyes) == 1:
         return tuple(eyes)
     recorded = ", ".join(sanitize(eye, 20) for eye in by_eye)
-    raise NergError(f'"{eyes[0].path}" and the files next to it record the eyes {recorded}; choose one (--eye)')
+    raise NergError(
+        f'"{eyes[0].path}" and the files next to it record the eyes {recorded}; choose one ({parameter("eye")})'
+    )
 
 
 # ---- Heads of Motion-BIDS ----
@@ -353,9 +357,9 @@ class _Motion:
         handedness = options.handedness or (_find_handedness(axes) if is_stated else None)
         if up is None or forward is None or handedness is None:
             raise NergError(
-                f'the reference frame of "{self.path}" (SpatialAxes "{sanitize(axes, 20)}" in its channels.json) does '
-                "not state all axes; set the up axis, the forward axis of the head at rest and the handedness (--up, "
-                "--forward, --hand)"
+                f'the reference frame of "{self.path}" (SpatialAxes "{sanitize(axes, 20)}" in its channels.json) '
+                "does not state all axes; set the up axis, the forward axis of the head at rest and the "
+                f"handedness ({parameter('up')}, {parameter('forward')}, {parameter('handedness')})"
             )
         return TrackingFrame(up, handedness, self.units), poses.parse_axis(forward, "forward")
 
@@ -417,7 +421,8 @@ def _choose_head(recording: Path, heads: Sequence[_Motion]) -> _Motion:
     if len(heads) > 1:
         points = ", ".join(sanitize(head.point, 40) for head in heads[:8])
         raise NergError(
-            f'several tracked points of "{recording}" may be the head ({points}); choose one (--rigid-body)'
+            f'several tracked points of "{recording}" may be the head ({points}); choose one '
+            f"({parameter('rigid_body')})"
         )
     return heads[0]
 
@@ -554,14 +559,15 @@ class Bids:
         frames |= {head.get_axes(options)[0] for head in heads}
         if not frames:
             raise NergError(
-                f'"{dataset.path}" has neither eye tracking (*_physio.tsv.gz with PhysioType "eyetrack") nor heads of '
-                "Motion-BIDS (*_motion.tsv with position and orientation of a tracked point named like a head; "
-                "otherwise name it with --rigid-body); specify another dataset or task"
+                f'"{dataset.path}" has neither eye tracking (*_physio.tsv.gz with PhysioType "eyetrack") nor heads '
+                "of Motion-BIDS (*_motion.tsv with position and orientation of a tracked point named like a head; "
+                f"otherwise name it with {parameter('rigid_body')}); specify another dataset or task"
             )
         if len(frames) > 1:
             texts = "; ".join(sorted(map(str, frames)))
             raise NergError(
-                f'the recordings of "{dataset.path}" have different frames ({texts}); import tasks separately (--task)'
+                f'the recordings of "{dataset.path}" have different frames ({texts}); import tasks separately '
+                f"({parameter('task')})"
             )
         return frames.pop()
 
@@ -597,8 +603,8 @@ def _frame_of_gaze(dataset: _Dataset, gaze: _Gaze, options: BidsOptions) -> Trac
     up, handedness = options.up or world.get("UpAxis"), options.handedness or world.get("Handedness")
     if up is None or handedness is None:
         raise NergError(
-            f'the JSON files of "{gaze.path}" do not state the axes of its world ({WORLD} with UpAxis and Handedness); '
-            "set them (--up, --hand)"
+            f'the JSON files of "{gaze.path}" do not state the axes of its world ({WORLD} with UpAxis and '
+            f"Handedness); set them ({parameter('up')}, {parameter('handedness')})"
         )
     return TrackingFrame(str(up), str(handedness), gaze.get_length_unit(ORIGIN[0]))
 
@@ -685,7 +691,9 @@ def _add_gaze(
         return
     parts = list(iterate(eyes[1]))
     if not parts:
-        raise NergError(f'"{eyes[1].path}" has no samples; copy it again, or import the other eye alone (--eye)')
+        raise NergError(
+            f'"{eyes[1].path}" has no samples; copy it again, or import the other eye alone ({parameter("eye")})'
+        )
     second = _Samples.join(parts)
     tolerance = _find_interval(second.times) / 2
     # Rows of the second eye become rays of their own only at times without a row of the first eye.

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError, sanitize
+from nerg_mi.errors import NergError, parameter, sanitize
 from nerg_mi.files.values import fold_name
 
 from .cells import AXES, is_missing
@@ -371,9 +371,9 @@ def require_valid_values(source: str, column: str, counts: Mapping[str, int]) ->
         values_text = ", ".join(f"{sanitize(value, 20) or 'nothing'} ({counts[value]:,} rows)" for value in most_common)
         suffix = f" and {len(counts) - _MAX_VALUES} more" if len(counts) > _MAX_VALUES else ""
         raise NergError(
-            f"{source}: the column {sanitize(column, 40)!r} contains {values_text}{suffix}, and it is uncertain which "
-            f'of them mark valid rows; name these (--valid "{sanitize(column, 40)}=VALUE,VALUE"), or use none '
-            "(--valid none)"
+            f"{source}: the column {sanitize(column, 40)!r} contains {values_text}{suffix}, and it is uncertain "
+            f"which of them mark valid rows; name these ({parameter('valid')} "
+            f'"{sanitize(column, 40)}=VALUE,VALUE"), or use none ({parameter("valid", "none")})'
         )
     return valid
 
@@ -404,7 +404,8 @@ def parse_valid(text: str | None) -> dict[str, tuple[str, ...]] | None:
         pairs = {"": ()}
     if any(not name or not any(values) for name, values in pairs.items()) or (not pairs and "none" not in text.lower()):
         raise NergError(
-            f'--valid is {sanitize(text, 60)!r}; it must be COLUMN=VALUE,VALUE (several separated by spaces), or "none"'
+            f"{parameter('valid')} is {sanitize(text, 60)!r}; it must be COLUMN=VALUE,VALUE (several separated by "
+            'spaces), or "none"'
         )
     return pairs
 

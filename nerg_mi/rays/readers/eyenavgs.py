@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.errors import NergError, sanitize
+from nerg_mi.errors import NergError, parameter, sanitize
 from nerg_mi.files.safe_read import resolve_path
 
 from . import poses
@@ -114,7 +114,7 @@ class EyeNavGSOptions:
 
     def __post_init__(self) -> None:
         if self.eye not in ("both", "left", "right"):
-            raise NergError(f'--eye is "{sanitize(self.eye, 40)}"; it must be both, left or right')
+            raise NergError(f'{parameter("eye")} is "{sanitize(self.eye, 40)}"; it must be both, left or right')
 
 
 class EyeNavGS(FixedFrameReader):

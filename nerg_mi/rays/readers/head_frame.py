@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.errors import sanitize
+from nerg_mi.errors import parameter, sanitize
 
 from . import poses
 from .columns import HEAD_WORDS, ROTATION_WORDS, SIDE_WORDS, find_head_positions, find_roles, split_stem
@@ -73,8 +73,9 @@ class HeadFrameFinder:
             which = "" if len(files) == self._num_sources else f" of {', '.join(files[:_MAX_NAMES])}{more}"
             columns = ", ".join(sanitize(name, 40) for name in names)
             yield (
-                f"all {what.replace(' ', which + ' ', 1)}, while {columns} {verb}: the gaze is in the head's frame; "
-                "combine it with the head's position and rotation (--map; nerg rays guess proposes a column map)"
+                f"all {what.replace(' ', which + ' ', 1)}, while {columns} {verb}: the gaze is in the head's "
+                f"frame; combine it with the head's position and rotation ({parameter('columns')}; nerg rays guess "
+                "proposes a column map)"
             )
 
     def _find_moving_position(self) -> tuple[str, ...] | None:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError, sanitize
+from nerg_mi.errors import NergError, parameter, sanitize
 from nerg_mi.files.safe_read import check_regular_file, translate_read_errors
 from nerg_mi.ranges import ELEVATIONS, ValidatedDataclass
 
@@ -56,10 +56,10 @@ def read_header(path: Path) -> MarkerHeader:
     with _open_c3d(path) as file:
         labels: list[str] = []
         for name in ("LABELS", *(f"LABELS{k}" for k in range(2, 259))):
-            parameter = file.get(f"POINT:{name}")
-            if parameter is None:
+            group = file.get(f"POINT:{name}")
+            if group is None:
                 break
-            labels += [str(label).strip() for label in np.ravel(parameter.string_array)]
+            labels += [str(label).strip() for label in np.ravel(group.string_array)]
         unit, axes = file.get("POINT:UNITS"), file.get_screen_axis()
         analog = [str(label).strip() for label in np.ravel(file.analog_labels)] if file.analog_used else []
         return MarkerHeader(
@@ -176,7 +176,9 @@ class C3d:
             unit = _find_unit(path, header, options)
             up = poses.parse_axis(self.frame([path], options).up, "up")
             if options.up is None and _find_up_axis(header) is None:
-                builder.add_warning(f'"{sanitize(path.name, 60)}" does not specify the up axis; z is assumed (--up)')
+                builder.add_warning(
+                    f'"{sanitize(path.name, 60)}" does not specify the up axis; z is assumed ({parameter("up")})'
+                )
             if not header.rate > 0:
                 raise NergError(f'"{path}" has no frame rate; export it again')
             head_markers = next(iter(heads.values()))[0]
@@ -216,9 +218,9 @@ class C3d:
             median_elevation = finite_median(elevations)
             if abs(median_elevation) > _MAX_TILT:
                 builder.add_warning(
-                    f'the heads in "{sanitize(path.name, 60)}" point {median_elevation:.0f} degrees up (median): are '
-                    "the markers at the front of the head as high as those at its sides? "
-                    f"--pitch {options.pitch - median_elevation:.0f} makes them level"
+                    f'the heads in "{sanitize(path.name, 60)}" point {median_elevation:.0f} degrees up (median): '
+                    "are the markers at the front of the head as high as those at its sides? "
+                    f"{parameter('pitch', f'{options.pitch - median_elevation:.0f}')} makes them level"
                 )
 
 
@@ -236,7 +238,7 @@ def _find_unit(path: Path, header: MarkerHeader, options: MarkerOptions) -> floa
     name = options.units or header.unit.lower()
     if name not in UNITS:
         problem = f'has the unit "{sanitize(header.unit, 20)}"' if header.unit else "has no unit of length"
-        raise NergError(f'"{path}" {problem}; specify m, cm or mm (--units)')
+        raise NergError(f'"{path}" {problem}; specify m, cm or mm ({parameter("units")})')
     return UNITS[name]
 
 
@@ -267,8 +269,9 @@ def _find_heads(
         available = [sanitize(label, 40) for label in header.labels]
         suffix = "" if len(available) <= _MAX_LISTED_MARKERS else f" and {len(available) - _MAX_LISTED_MARKERS} more"
         raise NergError(
-            f'no known head markers in "{path}"; its markers are {", ".join(available[:_MAX_LISTED_MARKERS])}{suffix}; '
-            "name those at the left, the right and the front of the head, as in --keypoints LTEMP,RTEMP,NOSE"
+            f'no known head markers in "{path}"; its markers are '
+            f"{', '.join(available[:_MAX_LISTED_MARKERS])}{suffix}; name those at the left, the right and the "
+            f"front of the head, as in {parameter('keypoints', 'LTEMP')},RTEMP,NOSE"
         )
     return heads
 

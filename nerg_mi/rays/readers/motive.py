@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.errors import NergError, sanitize
+from nerg_mi.errors import NergError, parameter, sanitize
 from nerg_mi.files.safe_read import read_line_blocks
 
 from . import poses
@@ -69,7 +69,7 @@ class Motive:
     validated_on = GENERATED_FILES
     signature = Signature(
         line=lambda line: "its first line is that of Motive's export" if line.startswith("Format Version,") else None,
-        question="the forward axis of the head's rigid body (--forward; default -z)",
+        question=f"the forward axis of the head's rigid body ({parameter('forward')}; default -z)",
     )
     Options = MotiveOptions
 
@@ -88,7 +88,8 @@ class Motive:
             if options.forward is None:
                 builder.add_warning(
                     f"the file does not contain the forward axis of the rigid body {sanitize(body, 40)!r}: "
-                    f"{_DEFAULT_FORWARD} is assumed; check it, and set it (--forward, also for {_DEFAULT_FORWARD})"
+                    f"{_DEFAULT_FORWARD} is assumed; check it, and set it ({parameter('forward')}, also for "
+                    f"{_DEFAULT_FORWARD})"
                 )
             builder.begin_source(path)
             numbers = [layout.columns[1], *layout.bodies[body]]
@@ -122,7 +123,8 @@ def _choose_body(path: Path, layout: MotiveLayout, requested: str | None) -> str
         return matches[0]
     names_text = ", ".join(sanitize(n, 40) for n in names[:12]) or "none"
     raise NergError(
-        f"{path} has the rigid bodies {names_text}; name the head's with --rigid-body, or export its rotation"
+        f"{path} has the rigid bodies {names_text}; name the head's with {parameter('rigid_body')}, or export its "
+        "rotation"
     )
 
 

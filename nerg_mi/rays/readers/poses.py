@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.maths.transforms import ROTATION_TOLERANCE, check_rigid_transforms, rotation_errors
 from nerg_mi.ranges import MAX_COORDINATE, TIMES
 
@@ -113,7 +113,9 @@ def rotations_from_angles(angles: np.ndarray, up: str, forward: str, degrees: bo
     angles = np.asarray(angles, dtype=np.float64)
     up, forward = up[-1], forward[-1]
     if up == forward:
-        raise NergError(f"the up axis and the forward axis are both {up}; set the forward axis of heads (--forward)")
+        raise NergError(
+            f"the up axis and the forward axis are both {up}; set the forward axis of heads ({parameter('forward')})"
+        )
     (side,) = set("xyz") - {up, forward}
     sequence = (up + side + forward).upper()[: angles.shape[1]]
     is_valid = np.isfinite(angles).all(axis=1) & ~is_filled_angles(angles)
@@ -131,7 +133,8 @@ def directions_from_azimuths(
     """
     if up[-1] == forward[-1]:
         raise NergError(
-            f"the up axis and the forward axis are both {up[-1]}; set the forward axis of heads (--forward)"
+            f"the up axis and the forward axis are both {up[-1]}; set the forward axis of heads "
+            f"({parameter('forward')})"
         )
     ahead, top = parse_axis(forward, "forward"), parse_axis(up, "up")
     right = np.cross(ahead, top) if handedness == "right" else np.cross(top, ahead)

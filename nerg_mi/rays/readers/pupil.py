@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.files.safe_read import resolve_path
 from nerg_mi.ranges import LENGTHS, Range, ValidatedDataclass
 
@@ -47,7 +47,10 @@ class Pupil:
         files=(("gaze_positions.csv", "head_pose_tracker_poses.csv"),),
         columns=(("gaze_timestamp", "gaze_normal0_x", "eye_center0_3d_x"),),
         options={"--marker": "METRES"},
-        question="the edge of a tracking marker in metres (--marker) and the up axis of the markers (--up)",
+        question=(
+            f"the edge of a tracking marker in metres ({parameter('marker')}) and the up axis of the markers "
+            f"({parameter('up')})"
+        ),
     )
     Options = PupilOptions
 
@@ -58,7 +61,7 @@ class Pupil:
         if options.marker is None or not options.marker > 0:
             raise NergError(
                 "Pupil's head poses are in units of the edge of a tracking marker; set its length in metres "
-                "(--marker 0.05)"
+                f"({parameter('marker', 0.05)})"
             )
         builder.add_metadata(floor="unknown")  # markers may be anywhere
         for path in files:
@@ -81,7 +84,7 @@ class Pupil:
                     confidence=v[:, 1],
                     head=rotation[:, :, 2],
                     drop={
-                        f"confidence below {options.min_confidence:g} (option --min-confidence)": v[:, 1]
+                        f"confidence below {options.min_confidence:g} (option min_confidence)": v[:, 1]
                         < options.min_confidence,
                         "there is no head pose at that time": has_no_pose,
                     },

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nerg_mi.errors import NergError, sanitize
+from nerg_mi.errors import NergError, parameter, sanitize
 from nerg_mi.files.safe_read import BadLineCallback, read_line_blocks, resolve_path
 
 from .base import GENERATED_FILES, RaysBuilder, Signature, TrackingFrame, option
@@ -81,7 +81,8 @@ def iterate_gaze_vectors(path: Path, on_bad_line: BadLineCallback | None = None)
                     reason = f": {sanitize(line, 60)!r} is not a sample ({sanitize(error)}); correct or remove the line"
                     if on_bad_line is None:
                         raise NergError(
-                            f"{path}, line {number}{reason}, or skip such lines with --skip-bad-lines"
+                            f"{path}, line {number}{reason}, or skip such lines with "
+                            f"{parameter('skip_bad_lines', True)}"
                         ) from None
                     on_bad_line(number, reason)
                 sample += 1
@@ -257,7 +258,7 @@ class NeonMocap:
     signature = Signature(
         columns=(("timestamp [ns]", "gaze_origin_X", "gaze_origin_Y", "gaze_origin_Z", "gaze_dir_X"),),
         options={"--up": "UP"},
-        question="the up axis of the motion capture (--up)",
+        question=f"the up axis of the motion capture ({parameter('up')})",
     )
     Options = NeonMocapOptions
 
@@ -267,8 +268,8 @@ class NeonMocap:
     def read(self, files: Sequence[Path], options: NeonMocapOptions, builder: RaysBuilder) -> None:
         if options.up is None:
             raise NergError(
-                "motion capture systems have different up axes; specify it (--up z for Qualisys and Vicon, "
-                "--up y for OptiTrack)"
+                f"motion capture systems have different up axes; specify it ({parameter('up', 'z')} for Qualisys "
+                f"and Vicon, {parameter('up', 'y')} for OptiTrack)"
             )
         for path in files:
             columns = ColumnFinder(path)

@@ -94,7 +94,7 @@ class Quest(FixedFrameReader):
                     confidence=confidence,
                     recorded_origin=poses_read[:, : len(eye_columns), :3].mean(axis=1),
                     drop={
-                        f"confidence below {options.min_confidence:g} (option --min-confidence)": confidence
+                        f"confidence below {options.min_confidence:g} (option min_confidence)": confidence
                         < options.min_confidence,
                         **_find_unusable(poses_read),
                     },

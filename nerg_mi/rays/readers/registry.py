@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.rays.rays import Rays
 
 from . import skeleton, table
@@ -85,13 +85,16 @@ def get_reader(name: str) -> Reader[Any]:
 def make_options(name: str, values: Mapping[str, Any]) -> Any:
     """Make the options of the reader ``name`` from ``values`` by field name; other fields have their defaults.
 
-    Raises `NergError` for options that the reader does not have, naming their flags, and for invalid values.
+    Raises `NergError` for options that the reader does not have, and for invalid values.
     """
     reader = get_reader(name)
-    names, flags = {o.name for o in list_options(reader.Options)}, {o.name: o.flag for o in collect_shared_options()}
-    foreign = ", ".join(flags.get(key, key) for key in values if key not in names)
+    names = {o.name for o in list_options(reader.Options)}
+    foreign = ", ".join(parameter(key) for key in values if key not in names)
     if foreign and name == TABLE:
-        raise NergError(f"{foreign} belongs to a preset; leave it out, or use --preset instead of --map")
+        raise NergError(
+            f"{foreign} belongs to a preset; leave it out, or use {parameter('preset')} instead of "
+            f"{parameter('columns')}"
+        )
     if foreign:
         raise NergError(f"preset {name} has fixed conventions; leave out {foreign}")
     return reader.Options(**values)

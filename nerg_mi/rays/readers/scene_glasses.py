@@ -11,7 +11,7 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from nerg_mi.errors import NergError, sanitize
+from nerg_mi.errors import NergError, parameter, sanitize
 from nerg_mi.files.safe_read import BadLineCallback, read_json
 from nerg_mi.formats.checkpoint import read_checkpoint
 from nerg_mi.maths.transforms import check_rigid_transforms
@@ -47,7 +47,7 @@ class FrameNames:
 
     def __post_init__(self) -> None:
         if sum(self.pattern.count(field) for field in _FIELDS) != 1:
-            raise NergError(f'--frames is "{sanitize(self.pattern, 80)}"; {_FRAMES_HELP}')
+            raise NergError(f'{parameter("frames")} is "{sanitize(self.pattern, 80)}"; {_FRAMES_HELP}')
 
     @classmethod
     def parse(cls, text: str) -> FrameNames:
@@ -104,7 +104,8 @@ class FrameNames:
             names_text = ", ".join(sanitize(n, 60) for n in names[:3])
             raise NergError(
                 f'no image of the model is called "{sanitize(self.pattern, 80)}" for the recording '
-                f'"{sanitize(recording, 60)}" (its first are {names_text}); correct --frames: {_FRAMES_HELP}'
+                f'"{sanitize(recording, 60)}" (its first are {names_text}); correct {parameter("frames")}: '
+                f"{_FRAMES_HELP}"
             )
         return out
 
@@ -118,9 +119,9 @@ class FrameNames:
         index = int(text) - (kind == "frame1")
         if frames is None and fps is None:
             raise NergError(
-                "the times of the video's frames are unknown, but the names contain frame numbers; put the file with "
-                "them next to the gaze (Tobii: the scene video, Neon: world_timestamps.csv), or set a constant rate "
-                "with --fps"
+                "the times of the video's frames are unknown, but the names contain frame numbers; put the file "
+                "with them next to the gaze (Tobii: the scene video, Neon: world_timestamps.csv), or set a "
+                f"constant rate with {parameter('fps')}"
             )
         if frames is None and fps is not None and index >= 0:
             return index / fps
@@ -129,8 +130,8 @@ class FrameNames:
             detail = "" if frames is None else f", which has {len(frames)}"
             detail += "" if fps is None else f" (at {fps:g} per second)"
             raise NergError(
-                f'"{sanitize(name, 80)}" is frame {index} of the video, counted from 0{detail}; check --frames, and '
-                "--fps if not every frame was extracted"
+                f'"{sanitize(name, 80)}" is frame {index} of the video, counted from 0{detail}; check '
+                f"{parameter('frames')}, and {parameter('fps')} if not every frame was extracted"
             )
         return float(frames[position])
 
@@ -171,7 +172,9 @@ class SceneCoordinates:
     def from_scale(cls, scale: float) -> SceneCoordinates:
         """Coordinates of the file in another unit. Raises `NergError` for an invalid scale."""
         if not (np.isfinite(scale) and 1e-9 <= scale <= 1e9):
-            raise NergError(f"the length of the model's unit in metres must be positive, got {scale} (--scale)")
+            raise NergError(
+                f"the length of the model's unit in metres must be positive, got {scale} ({parameter('scale')})"
+            )
         return cls(scale, np.eye(3), np.zeros(3))
 
     @classmethod
@@ -184,8 +187,9 @@ class SceneCoordinates:
             up = None if provenance.get("up") is None else np.array(provenance["up"], np.float64).reshape(3)
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise NergError(
-                f'the checkpoint "{path}" does not contain the coordinates of its training; use --scale instead of '
-                "--field if it was trained in those of its file, or train it again"
+                f'the checkpoint "{path}" does not contain the coordinates of its training; use '
+                f"{parameter('scale')} instead of {parameter('place')} if it was trained in those of its file, or "
+                "train it again"
             ) from error
         to_file = check_rigid_transforms(to_file, f'"to_file" of the checkpoint "{path}"', may_scale=True, shape=(4, 4))
         scale = float(np.cbrt(np.linalg.det(to_file[:3, :3])))
@@ -408,7 +412,9 @@ class SceneCameraOptions(ValidatedDataclass):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.place is not None and self.scale != 1.0:
-            raise NergError("the checkpoint contains the scale; leave out --scale, or --field")
+            raise NergError(
+                f"the checkpoint contains the scale; leave out {parameter('scale')}, or {parameter('place')}"
+            )
 
     @property
     def frame(self) -> TrackingFrame:
@@ -467,7 +473,7 @@ class SceneGaze:
             with np.errstate(invalid="ignore"):
                 angles = angles_between(direction, block.other_direction)
             self._angles.append(angles[np.isfinite(angles) & ~np.any(list(drop.values()), axis=0)])
-        drop["no frame of the scene camera near that time has a pose (option --max-gap)"] = has_no_pose
+        drop["no frame of the scene camera near that time has a pose (option gap)"] = has_no_pose
         ray = poses.rotate(rotation, direction)
         head = rotation[:, :, 2]
         self._builder.add(block.t, self._person, position, ray, rows=block.rows, tracking="eye", head=head, drop=drop)
@@ -508,7 +514,7 @@ def _make_camera_track(options: SceneCameraOptions, recording: Recording, builde
     if options.poses is None:
         raise NergError(
             "the poses of the scene camera are required: specify the model in which frames of its video were "
-            "registered with the photos of the environment (--poses transforms.json)"
+            f"registered with the photos of the environment ({parameter('poses', 'transforms.json')})"
         )
     to_scene = SceneCoordinates.from_scale(options.scale)
     if options.place is not None:
@@ -544,8 +550,9 @@ def _read_model_track(
         builder.add_warning(note)
     if options.frames is None:
         raise NergError(
-            f'the images of "{model.path}" that are frames of the video, and their times, must be specified, '
-            f'as with --frames "frame_{{frame1}}"; first images: {", ".join(sanitize(n, 60) for n in model.names[:3])}'
+            f'the images of "{model.path}" that are frames of the video, and their times, must be specified, as '
+            f"with {parameter('frames', 'frame_{frame1}')}; first images: "
+            f"{', '.join(sanitize(n, 60) for n in model.names[:3])}"
         )
     times = options.frames.compute_times(model.names, recording.name, recording.frames, options.fps, recording.start)
     if recording.frames is None and options.frames.needs_frame_times:
@@ -583,8 +590,8 @@ def _check_up_axis(up: np.ndarray | None, options: SceneCameraOptions, builder: 
         axis = max(poses.AXES, key=lambda name: poses.AXES[name] @ up)
         builder.add_warning(
             f"the up direction of the scene is ({', '.join(f'{x:.2f}' for x in up)}), {tilt:.0f} degrees from "
-            f"{options.up}: train it with --coordinates upright, or import with --up {axis} and pass the matrix of "
-            "--align-output to the training"
+            f"{options.up}: train it with {parameter('coordinates', 'upright')}, or import with "
+            f"{parameter('up', axis)} and pass the matrix of {parameter('align_output')} to the training"
         )
 
 
@@ -599,8 +606,9 @@ POSE_OPTIONS = {"--poses": "MODEL", "--frames": "frame_{frame1}"}
 """Options of these readers that only the user can set, with placeholders as values."""
 
 POSE_QUESTION = (
-    "the poses of the scene camera: --poses is the model with its frames and the photos of the environment, --frames "
-    "the pattern of their names, --field the scene that was trained on it"
+    f"the poses of the scene camera: {parameter('poses')} is the model with its frames and the photos of the "
+    f"environment, {parameter('frames')} the pattern of their names, {parameter('place')} the scene that was "
+    "trained on it"
 )
 """Description of these options."""
 
@@ -635,8 +643,9 @@ class SceneReader(ABC, Generic[R]):
     def read(self, files: Sequence[Path], options: SceneCameraOptions, builder: RaysBuilder) -> None:
         if len(files) > 1 and (options.frames is None or not options.frames.has_recording):
             raise NergError(
-                "frames of several recordings are distinguished by {recording} in their names (--frames); import the "
-                'recordings one by one, or use a pattern such as --frames "{recording}/frame_{frame1}"'
+                "frames of several recordings are distinguished by {recording} in their names "
+                f"({parameter('frames')}); import the recordings one by one, or use a pattern such as "
+                f"{parameter('frames', '{recording}/frame_{frame1}')}"
             )
         summaries: list[dict[str, Any]] = []
         for path in files:

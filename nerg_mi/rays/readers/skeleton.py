@@ -15,7 +15,7 @@ from typing import IO, NamedTuple
 
 import numpy as np
 
-from nerg_mi.errors import NergError, sanitize
+from nerg_mi.errors import NergError, parameter, sanitize
 from nerg_mi.files.atomic import replace_atomically
 from nerg_mi.files.safe_read import BadLineCallback, read_line_blocks
 from nerg_mi.ranges import ELEVATIONS
@@ -185,7 +185,8 @@ def _parse_line(line: str, layout: Layout) -> tuple[str, int, str] | str:
 def _report_bad_line(path: str | os.PathLike, line: int, reason: str, on_bad_line: BadLineCallback | None) -> None:
     if on_bad_line is None:
         raise NergError(
-            f"{path}, line {line}{reason}; correct or remove the line, or skip such lines with --skip-bad-lines"
+            f"{path}, line {line}{reason}; correct or remove the line, or skip such lines with "
+            f"{parameter('skip_bad_lines', True)}"
         )
     on_bad_line(line, reason)
 
@@ -292,7 +293,7 @@ class Skeleton:
         if max(numbers) >= self.keypoints:
             raise NergError(
                 f'there is no keypoint "{name}" in {self.title}; use indices from 0 to '
-                f"{self.keypoints - 1}, or the names {', '.join(self.joints)} (--keypoints)"
+                f"{self.keypoints - 1}, or the names {', '.join(self.joints)} ({parameter('keypoints')})"
             )
         return numbers
 
@@ -493,7 +494,7 @@ def parse_keypoints(text: str) -> HeadKeypoints:
     """Parse ``"2,13,11"`` or ``"left_ear,right_ear,left_eye+right_eye"``. Raises `NergError` for other text."""
     words = [word.strip() for word in text.split(",")]
     if len(words) != 3 or not all(words):
-        raise NergError(f"--keypoints needs three keypoints: left ear, right ear, nose; got {text!r}")
+        raise NergError(f"{parameter('keypoints')} needs three keypoints: left ear, right ear, nose; got {text!r}")
     left, right, front = (int(word) if word.isdecimal() else word for word in words)
     return left, right, front
 
@@ -523,7 +524,9 @@ class SkeletonOptions(TickOption):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.skeleton is not None and self.skeleton not in SKELETONS:
-            raise NergError(f'there is no skeleton "{self.skeleton}"; use one of {", ".join(SKELETONS)} (--skeleton)')
+            raise NergError(
+                f'there is no skeleton "{self.skeleton}"; use one of {", ".join(SKELETONS)} ({parameter("skeleton")})'
+            )
 
 
 def _recognize(line: str) -> str | None:
@@ -549,7 +552,10 @@ class SkeletonFile:
     validated_on = GENERATED_FILES
     signature = Signature(
         line=_recognize,
-        question="the unit of the time (--tick); the quality report suggests one for the sampling rate of a device",
+        question=(
+            f"the unit of the time ({parameter('tick')}); the quality report suggests one for the sampling rate of "
+            "a device"
+        ),
     )
     Options = SkeletonOptions
 
@@ -566,7 +572,9 @@ class SkeletonFile:
             )
             groups = [skeleton.find_keypoints(place) for place in keypoints]
             if len({tuple(sorted(group)) for group in groups}) < len(groups):
-                raise NergError(f"the keypoints {', '.join(map(str, keypoints))} are not all different (--keypoints)")
+                raise NergError(
+                    f"the keypoints {', '.join(map(str, keypoints))} are not all different ({parameter('keypoints')})"
+                )
             head = [k for group in groups for k in group]
             hips = [skeleton.joints[hip] for hip in ("left_hip", "right_hip") if hip in skeleton.joints]
             builder.add_metadata(skeleton=name, keypoints=list(keypoints))
@@ -674,7 +682,7 @@ def _find_skeleton(path: Path, options: SkeletonOptions, builder: RaysBuilder) -
     if options.skeleton is None and name != PAPER_SKELETON:
         alternatives = "".join(f" (or {other}, with the same number)" for other, _ in matches[1:])
         builder.add_warning(
-            f'"{sanitize(path.name, 60)}" has {layout.keypoints} keypoints; {SKELETONS[name].title} is assumed'
-            f"{alternatives}: set it with --skeleton"
+            f'"{sanitize(path.name, 60)}" has {layout.keypoints} keypoints; {SKELETONS[name].title} is '
+            f"assumed{alternatives}: set it with {parameter('skeleton')}"
         )
     return name, layout

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 
 from . import columns as names
 from . import poses
@@ -138,8 +138,8 @@ def _find_columns(table: ColumnFinder, person: str | None) -> SdkColumns:
     complete = [eye for eye in eye_columns if eye is not None]
     if len(complete) < len(eye_columns):
         raise NergError(
-            f"{table.path} has no gaze_origin_mm_{{x,y,z}} or no gaze_direction_normalized_{{x,y,z}}; name its columns "
-            "with --map, or is it a log of another device?"
+            f"{table.path} has no gaze_origin_mm_{{x,y,z}} or no gaze_direction_normalized_{{x,y,z}}; name its "
+            f"columns with {parameter('columns')}, or is it a log of another device?"
         )
     head, rotation = (
         table.require_vector(*names.HEADSET_POSITION_NAMES),

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.errors import NergError, sanitize
+from nerg_mi.errors import NergError, parameter, sanitize
 from nerg_mi.ranges import Range, ValidatedDataclass
 from nerg_mi.rays.rays import TRACKING, merge_tracking
 
@@ -76,9 +76,11 @@ class TableOptions(ValidatedDataclass):
         parse_valid(self.valid)
         poses.parse_axis(self.forward_axis, "forward")
         if self.tracking not in (None, "eye", "head"):
-            raise NergError(f'--tracking must be eye or head, got "{sanitize(self.tracking, 40)}"')
+            raise NergError(f'{parameter("tracking")} must be eye or head, got "{sanitize(self.tracking, 40)}"')
         if self.person_from not in ("column", "filename"):
-            raise NergError(f'persons are named by "column" or "filename" (--person-from), not by "{self.person_from}"')
+            raise NergError(
+                f'persons are named by "column" or "filename" ({parameter("person_from")}), not by "{self.person_from}"'
+            )
 
     @property
     def frame(self) -> TrackingFrame:
@@ -132,7 +134,7 @@ def add_tables(
     columns. Raises `NergError` for missing columns, cells that are not numbers, and uncertain values of validity.
     """
     if options.columns is None:
-        raise NergError("a table needs a column map; specify its columns (--map)")
+        raise NergError(f"a table needs a column map; specify its columns ({parameter('columns')})")
     valid = parse_valid(options.valid)
     if valid is None:
         valid = {name: require_valid_values(files[0].name, name, _count_values(files, name)) for name in validity}
@@ -144,8 +146,8 @@ def add_tables(
         builder.add_metadata(degrees=not options.radians)
     if rows.columns.t is None and options.tick == 1.0:
         builder.add_warning(
-            "no column is the time, so rows are one second apart: name it (--map t=), or set the sampling interval "
-            "(--tick)"
+            f"no column is the time, so rows are one second apart: name it ({parameter('columns', 't=...')}), or set "
+            f"the sampling interval ({parameter('tick')})"
         )
     _check_units(rows.columns, options, builder)
     for path in files:
@@ -159,8 +161,9 @@ def _check_units(columns: ColumnMap, options: TableOptions, builder: RaysBuilder
     named = next((name for name in lengths if parse_length_unit(name) not in (None, options.units)), None)
     if named is not None:
         builder.add_warning(
-            f"{sanitize(named, 40)!r} is in {parse_length_unit(named)} by its name, but was read in {options.units}: "
-            f"set --units {parse_length_unit(named)} (with --map), unless the name is wrong"
+            f"{sanitize(named, 40)!r} is in {parse_length_unit(named)} by its name, but was read in "
+            f"{options.units}: set {parameter('units', parse_length_unit(named))} (with {parameter('columns')}), "
+            "unless the name is wrong"
         )
 
 
@@ -183,7 +186,7 @@ def find_person(table: ColumnFinder, builder: RaysBuilder) -> str | None:
         return name
     builder.add_warning(
         f"{name!r} has another value in nearly every row, like a row counter, and is not used as the participant: "
-        f"each file is one participant (or specify the column: --map person={name})"
+        f"each file is one participant (or specify the column: {parameter('columns', f'person={name}')})"
     )
     return None
 
@@ -247,9 +250,9 @@ class MappedRows:
         if self._turns and not self._moves:
             names = ", ".join(sanitize(name, 40) for name in self.pose_columns[:2])
             builder.add_warning(
-                f"the matrices {names}, ... turn, but all their positions are "
-                "0, 0, 0: if they are written column by column, name their columns row by row (--map matrix=); "
-                "otherwise the heads stay at the origin"
+                f"the matrices {names}, ... turn, but all their positions are 0, 0, 0: if they are written column "
+                f"by column, name their columns row by row ({parameter('columns', 'matrix=...')}); otherwise the heads "
+                "stay at the origin"
             )
         # Heads turn around; gaze in the head's frame exceeds two degrees.
         limit = 2 * np.pi if self.columns.pose == "ypr" else np.pi / 2
@@ -257,8 +260,8 @@ class MappedRows:
             return
         names = ", ".join(sanitize(name, 40) for name in (*self.pose_columns, *self.angle_columns))
         builder.add_warning(
-            f"{names} were read as degrees, but none exceeds {self._max_angle:.3g}: are they radians (--map with "
-            "--radians), or a quaternion without its w?"
+            f"{names} were read as degrees, but none exceeds {self._max_angle:.3g}: are they radians "
+            f"({parameter('columns')} with {parameter('radians', True)}), or a quaternion without its w?"
         )
 
     def _add_block(self, path: Path, block: TableBlock, first_row: int, builder: RaysBuilder, tracking: str) -> None:
@@ -276,10 +279,10 @@ class MappedRows:
             self._max_angle = max(self._max_angle, float(np.nanmax(np.abs(vector(angles)), initial=0.0)))
         drop = self._find_unusable_poses(path, block, vector)
         is_uncertain = confidence < options.min_confidence
-        drop |= {f"confidence below {options.min_confidence:g} (option --min-confidence)": is_uncertain}
+        drop |= {f"confidence below {options.min_confidence:g} (option min_confidence)": is_uncertain}
         for name, words in self.valid.items():
             values_text = " or ".join(dict.fromkeys(w.lower() for w in words)) or "valid"
-            drop[f"{name} is not {values_text} (option --valid)"] = ~mark_valid(word[name], words)
+            drop[f"{name} is not {values_text} (option valid)"] = ~mark_valid(word[name], words)
         builder.add(
             t * options.tick,
             word[self.person] if self.person else person_from_filename(path),

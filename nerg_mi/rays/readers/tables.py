@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from nerg_mi.errors import NergError, sanitize
+from nerg_mi.errors import NergError, parameter, sanitize
 from nerg_mi.files.safe_read import BadLineCallback, read_line_blocks, translate_read_errors
 from nerg_mi.files.tables import SEPARATOR_LINE, find_separator
 from nerg_mi.files.values import find_name, to_name, to_numbers, to_seconds
@@ -148,7 +148,7 @@ def iterate_table(
 
 def _report_bad_line(path: str | os.PathLike, line: int, reason: str, on_bad_line: BadLineCallback | None) -> None:
     if on_bad_line is None:
-        raise NergError(f"{path}, line {line}{reason}, or skip such lines with --skip-bad-lines")
+        raise NergError(f"{path}, line {line}{reason}, or skip such lines with {parameter('skip_bad_lines', True)}")
     on_bad_line(line, reason)
 
 
@@ -382,7 +382,7 @@ def _join_lines(lines: list[str], layout: _Layout) -> tuple[list[str], list[int]
 
 def _split_header(path: str | os.PathLike, line: str, separator: str) -> list[str]:
     if line.startswith("Format Version,"):
-        raise NergError(f'"{path}" is an export of OptiTrack\'s Motive; import it with --preset motive')
+        raise NergError(f'"{path}" is an export of OptiTrack\'s Motive; import it with {parameter("preset", "motive")}')
     if line.count(separator) >= MAX_COLUMNS:
         raise NergError(
             f'the table "{path}" has more columns than the maximum of {MAX_COLUMNS:,}; provide one with fewer'
@@ -666,7 +666,7 @@ _OTHER_FILES = {
 }
 
 
-def explain_columns(columns: Sequence[str], remedy: str = "choose some of them with --map") -> str:
+def explain_columns(columns: Sequence[str], remedy: str = f"choose some of them with {parameter('columns')}") -> str:
     """The end of a sentence about missing columns: which ``columns`` there are, and the ``remedy``; or why there is no
     header."""
     if not any(columns):
@@ -694,7 +694,9 @@ def check_columns(path: str | os.PathLike, requested: Sequence[str], available: 
         raise NergError(f'the table "{path}" has several columns called {sanitize(repeated, 40)!r}; rename all but one')
     twice = next((c for c in requested if requested.count(c) > 1), None)
     if twice is not None:
-        raise NergError(f"the column {sanitize(twice, 40)!r} of {path} has two roles; use another one in --map")
+        raise NergError(
+            f"the column {sanitize(twice, 40)!r} of {path} has two roles; use another one in {parameter('columns')}"
+        )
 
 
 # ---- Times of day, and dates with times, as text: ISO 8601 and similar notations ----

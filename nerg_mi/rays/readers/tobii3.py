@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError, sanitize
+from nerg_mi.errors import NergError, parameter, sanitize
 from nerg_mi.files.safe_read import BadLineCallback, parse_json, read_json, read_line_blocks, resolve_path
 from nerg_mi.files.video import read_frame_times
 
@@ -167,7 +167,7 @@ def _parse_sample(
         reason = ": it is not a JSON object of a sample with type, timestamp and data"
         if on_bad_line is None:
             raise NergError(
-                f"{path}, line {line}{reason}; correct it, or skip such lines with --skip-bad-lines"
+                f"{path}, line {line}{reason}; correct it, or skip such lines with {parameter('skip_bad_lines', True)}"
             ) from error
         on_bad_line(line, reason)
         return None

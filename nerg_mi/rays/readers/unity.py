@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from nerg_mi.errors import NergError, sanitize
+from nerg_mi.errors import NergError, parameter, sanitize
 
 from . import columns as names
 from .base import GENERATED_FILES, UNITY, FixedFrameReader, RaysBuilder, Signature, TickOption, valid_option
@@ -51,8 +51,8 @@ class UnityReader(FixedFrameReader):
             if (other_columns := str(self._make_map(other, find_person(other, builder)))) != str(columns):
                 raise NergError(
                     f"{other.path} has other columns ({sanitize(other_columns)}) than {first.path} "
-                    f"({sanitize(columns)}); "
-                    "import them separately, or with one column map (--map)"
+                    f"({sanitize(columns)}); import them separately, or with one column map "
+                    f"({parameter('columns')})"
                 )
         settings = TableOptions(
             columns=columns,

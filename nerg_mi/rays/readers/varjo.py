@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.errors import NergError, sanitize
+from nerg_mi.errors import NergError, parameter, sanitize
 
 from . import poses
 from .base import GENERATED_FILES, UNITY, FixedFrameReader, NoOptions, RaysBuilder, Signature
@@ -71,7 +71,8 @@ def _is_valid(path: Path, status: np.ndarray) -> np.ndarray:
     unknown = ~np.isin(status, [*_STATUS_VALUES, ""])
     if unknown.any():
         raise NergError(
-            f"{path} has the GazeStatus {sanitize(status[unknown][0], 20)!r}, whose meaning is uncertain; it must be "
-            f"one of {', '.join(_STATUS_VALUES)}: correct the cells, or import with --map and --valid"
+            f"{path} has the GazeStatus {sanitize(status[unknown][0], 20)!r}, whose meaning is uncertain; it must "
+            f"be one of {', '.join(_STATUS_VALUES)}: correct the cells, or import with {parameter('columns')} and "
+            f"{parameter('valid')}"
         )
     return np.isin(status, _STATUS_VALUES[-2:])

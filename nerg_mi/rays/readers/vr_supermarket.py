@@ -79,7 +79,7 @@ class VrSupermarket(FixedFrameReader):
                     head=-rotation[:, :, 2],
                     recorded_direction=v[:, 12:15],
                     drop={
-                        f"an eye is closed: openness at most {min_openness:g} (option --min-openness)": openness
+                        f"an eye is closed: openness at most {min_openness:g} (option min_openness)": openness
                         <= min_openness,
                         "the head's matrix is mirrored against those of most rows": is_mirrored
                         != (is_mirrored.mean() > 0.5),

@@ -222,7 +222,7 @@ def test_members_have_no_hits_of_their_own():
     """They would be lost, because an ensemble mixes in its own."""
     member = made()
     member.hits = ReaimedHits(np.zeros((1, 3)), np.ones((1, 3)), 0.5, 0.4, 50.0)
-    with pytest.raises(ValueError, match="--no-reaimed-hits"):
+    with pytest.raises(ValueError, match="reaimed_hits=False"):
         GazeEnsemble([member, made(seed=1)])
 
 

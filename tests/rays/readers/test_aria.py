@@ -245,13 +245,13 @@ def test_worlds(tmp_path):
     # 50 to 90 ms are in two; 0 to 40 in one; rows within 0.05 s of the gap between them are in neither.
     rays = read("aria", tmp_path / "ann", world="two")
     assert np.allclose(rays.t, [0.05, 0.06, 0.07, 0.08, 0.09])
-    assert dropped(rays) == {"the pose is in another world, by its graph_uid (option --world)": [[2, 6]]}
+    assert dropped(rays) == {"the pose is in another world, by its graph_uid (option world)": [[2, 6]]}
     assert rays.metadata["world"] == "two" and rays.metadata["other_worlds"] == {"one": 5}
     poses.write_text(first + "\n".join(second.split("\n")[1:30]) + "\n")
     rays = read("aria", tmp_path / "ann")
     assert rays.metadata["world"] == "one" and len(rays) == 5
     assert dropped(rays) == {
-        "the pose is in another world, by its graph_uid (option --world)": [[7, 9]],
+        "the pose is in another world, by its graph_uid (option world)": [[7, 9]],
         "there is no pose of the glasses at that time": [[10, 11]],
     }
     with pytest.raises(NergError, match='"three"'):

@@ -203,7 +203,7 @@ def test_invalid_input_is_refused(tmp_path):
     ):
         with pytest.raises(NergError, match=message):
             read("eyenavgs", cases)
-    with pytest.raises(NergError, match='--eye is "third"'):
+    with pytest.raises(NergError, match='eye is "third"'):
         read("eyenavgs", path, eye="third")
 
 

@@ -73,7 +73,7 @@ def test_origins_that_never_move(tmp_path):
     gaze = make_walk()[2]
     path = write(tmp_path / "t.csv", {"gaze_origin": np.zeros((COUNT, 3)), "gaze_forward": gaze})
     (warning,) = read_warnings(path)
-    assert "all origins are 0, 0, 0 m" in warning and "--units" not in warning
+    assert "all origins are 0, 0, 0 m" in warning and "units" not in warning
 
 
 @pytest.mark.parametrize("kind", ["quaternion", "radians", "degrees"])
@@ -100,7 +100,7 @@ def test_proposal_combines_local_gaze_with_the_head(tmp_path, kind):
     path = write(tmp_path / "t.csv", columns)
     proposal = propose_import(path)
     assert proposal.columns is not None and proposal.columns.origin == tuple(f"HMD_position_{a}" for a in "xyz")
-    assert ("--radians" in proposal.options) == (kind == "radians")
+    assert ("radians" in proposal.options) == (kind == "radians")
     options = {"up": proposal.options["--up"], "handedness": proposal.options["--hand"], "radians": kind == "radians"}
     forward = proposal.options.get("--forward")
     assert forward in (None, "z")

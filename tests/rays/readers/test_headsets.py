@@ -119,7 +119,7 @@ def test_quest_both_eyes_in_the_world(tmp_path, rig):
         rays.direction, direction[selected][:, UNITY]
     )
     assert np.allclose(rays.confidence, [0.9, *[0.8] * (N - 2)]) and dropped(rays) == {
-        "confidence below 0.5 (option --min-confidence)": [[3, 3]]
+        "confidence below 0.5 (option min_confidence)": [[3, 3]]
     }
     assert len(read("quest", path, min_confidence=0.1)) == N
 
@@ -266,7 +266,7 @@ def test_unity_local_and_head(tmp_path):
 def test_unity_missing_columns_are_reported(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text("time,gaze_origin_x,gaze_origin_y,gaze_origin_z\n0,0,0,0\n")
-    with pytest.raises(NergError, match="no columns gaze_dir_{x,y,z} or .*name columns with --map"):
+    with pytest.raises(NergError, match="no columns gaze_dir_{x,y,z} or .*name columns with columns"):
         read("unity", path)
     head = "gaze_origin_x,gaze_origin_y,gaze_origin_z,gaze_dir_x,gaze_dir_y,gaze_dir_z"
     path.write_text(head + "\n0,0,0,0,0,1\n")
@@ -377,7 +377,7 @@ def test_varjo_truncated_vector(tmp_path):
     """Errors in Varjo's cells are reported with line and column, or skipped and counted."""
     path, rows = tmp_path / "ann.csv", "".join(VARJO_ROW.format(i * 10**7, "VALID") for i in range(5))
     path.write_text(VARJO_HEAD + "1;(0, 1.6;(0, 0, 0, 1);(0, 0;(0, oops);VALID\n" + rows)
-    with pytest.raises(NergError, match="2.*'HMDPosition'.*--skip-bad-lines"):
+    with pytest.raises(NergError, match="2.*'HMDPosition'.*skip_bad_lines"):
         read("varjo", path)
     rays = read("varjo", path, skip_bad_lines=True)
     assert len(rays) == 5 and rays.t[0] == 0 and rays.metadata["rows_read"] == 6
@@ -435,7 +435,7 @@ def test_supermarket_frame_eyes_and_openness(tmp_path):
     assert np.allclose(rays.head, (turn @ (0, 0, -1))[[0, 2, 1]])
     assert np.allclose(rays.origin, ((1, 1.6, 2) + turn @ (0.01, 0, -0.1))[[0, 2, 1]])
     assert dropped(rays) == {
-        "an eye is closed: openness at most 0.5 (option --min-openness)": [[3, 3]],
+        "an eye is closed: openness at most 0.5 (option min_openness)": [[3, 3]],
         "confidence is missing or outside [0, 1]": [[5, 5]],
     }
     assert len(read("vr_supermarket", path, min_openness=0.4)) == 3

@@ -151,7 +151,7 @@ def test_bad_lines_are_reported_and_skipped(tmp_path, poses, keypoints):
     assert list(rows.ids) == poses[0] and rows.lines.tolist() == [1, 3, 5, 7, 9, 11, 13]
     assert sorted(reported) == [2, 4, 6, 8, 10, 12, 14]
     assert all(why in reported[line] for line, why in zip(sorted(reported), bad.values()))
-    with pytest.raises(NergError, match="4.*2.*--skip-bad-lines"):
+    with pytest.raises(NergError, match="4.*2.*skip_bad_lines"):
         read_skeleton(path)
 
 
@@ -284,7 +284,7 @@ def test_unknown_skeletons_are_refused(tmp_path):
         read("skeleton", path)
     with pytest.raises(NergError, match="57.*coco17.*17"):
         read("skeleton", path, skeleton="coco17")
-    with pytest.raises(NergError, match="nerg22.*coco17.*--skeleton"):
+    with pytest.raises(NergError, match="nerg22.*coco17.*skeleton"):
         read("skeleton", path, skeleton="coco18")
     write_skeleton(path, ["ann"] * 2, np.arange(2), np.ones((2, 17, 3)))
     for place in (17, "chin", "left_ear+", "-1"):
@@ -333,5 +333,5 @@ def test_keypoints_of_the_command_line():
     assert parse_keypoints("19,8,10") == (19, 8, 10)
     assert parse_keypoints("left_ear, 4,left_eye+right_eye") == ("left_ear", 4, "left_eye+right_eye")
     for text in ("1,2", "1,2,3,4", "a,,c"):
-        with pytest.raises(NergError, match="--keypoints needs three keypoints"):
+        with pytest.raises(NergError, match="keypoints needs three keypoints"):
             parse_keypoints(text)

@@ -31,7 +31,7 @@ def test_table_of_another_frame(tmp_path):
     assert np.allclose(rays.t, [0, 1]) and [rays.persons[p] for p in rays.person] == ["bo", "ann"]
     assert {d["reason"]: d["rows"] for d in rays.metadata["dropped"]} == {
         "direction is missing": [[5, 5]],
-        "confidence below 0.5 (option --min-confidence)": [[3, 3]],
+        "confidence below 0.5 (option min_confidence)": [[3, 3]],
     }
     assert rays.metadata["source_frame"] == {"up": "y", "handedness": "left", "units": "cm"}
     by_file = read_table(path, mapping, person_from="filename")
@@ -134,7 +134,7 @@ def test_cohorts_persons_and_validity(tmp_path):
     assert rays.persons == ("ann", "bo") and list(rays.person) == [1, 0]
     assert rays.cohorts == ("unknown", "new") and list(rays.cohort) == [1, 0]
     assert {d["reason"]: d["rows"] for d in rays.metadata["dropped"]} == {
-        "ok is not valid (option --valid)": [[5, 5]],
+        "ok is not valid (option valid)": [[5, 5]],
         "person is missing": [[4, 4]],
     }
     again = tmp_path / "rays.npz"
@@ -362,7 +362,7 @@ def test_times_that_the_names_contradict_are_reported(tmp_path, time):
     path.write_text(f"x,y,z,a,b,c,{time}\n0,0,0,1,0,0,0\n0,0,0,1,0,0,20\n")
     columns = "origin=x,y,z direction=a,b,c" + (f' "t={time}"' if time else "")
     said = read_table(path, columns).metadata.get("complaints", [])
-    assert len(said) == (unit != 1.0) and all("--tick" in text for text in said)  # noqa: RUF069 (stored)
+    assert len(said) == (unit != 1.0) and all("tick" in text for text in said)  # noqa: RUF069 (stored)
     assert "complaints" not in read_table(path, columns, tick=unit or 0.02).metadata
 
 
@@ -372,7 +372,7 @@ def test_lengths_that_the_names_contradict_are_reported(tmp_path, suffix, units)
     path.write_text(",".join([*(f"p{a}{suffix}" for a in "xyz"), "a,b,c,t\n0,0,0,1,0,0,0\n"]))
     columns = " ".join([f'"origin={",".join(f"p{a}{suffix}" for a in "xyz")}"', "direction=a,b,c t=t"])
     said = read_table(path, columns).metadata.get("complaints", [])
-    assert len(said) == (units != "m") and all(f"--units {units}" in text for text in said)
+    assert len(said) == (units != "m") and all(f'units="{units}"' in text for text in said)
     assert "complaints" not in read_table(path, columns, units=units).metadata
 
 
@@ -383,7 +383,7 @@ def test_radians_that_are_read_as_degrees_are_reported(tmp_path, role):
         (tmp_path / "t.csv").write_text("x,y,z,a,b,c,t\n" + rows)
         return read_table(tmp_path / "t.csv", f"origin=x,y,z {role} t=t", **options).metadata.get("complaints", [])
 
-    assert ["--radians" in text for text in said(1.5)] == [True]
+    assert ["radians" in text for text in said(1.5)] == [True]
     assert not said(1.5, radians=True) and not said(85.0) and not said(0.0)
 
 
@@ -416,5 +416,5 @@ def test_what_was_tracked_can_be_stated(tmp_path):
     (tmp_path / "a.csv").write_text("t,x,y,z,a,b,c\n0,1,2,3,1,0,0\n")
     columns = "origin=x,y,z direction=a,b,c t=t"
     assert read_table(tmp_path / "a.csv", columns, tracking="head").tracking == "head"
-    with pytest.raises(NergError, match="--tracking must be eye or head"):
+    with pytest.raises(NergError, match="tracking must be eye or head"):
         TableOptions(tracking="ear")

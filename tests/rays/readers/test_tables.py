@@ -100,7 +100,7 @@ def test_bad_lines_are_reported_and_skipped(tmp_path, monkeypatch, bad, fast):
     assert np.concatenate([block.numbers for block in blocks])[:, 0].tolist() == [0, 1, 2, 3, 4, 7]
     assert np.concatenate([block.lines for block in blocks]).tolist() == [2, 3, 4, 5, 6, 8]
     assert [line for line, _ in bad_lines] == [7]
-    with pytest.raises(NergError, match="t.csv, line 7[:,].*--skip-bad-lines"):
+    with pytest.raises(NergError, match="t.csv, line 7[:,].*skip_bad_lines"):
         read(path, ["a", "b"])
 
 
@@ -502,7 +502,7 @@ def test_vectors_in_cells_of_parquet(tmp_path):
         ("# recorded by a program\nx,y\n1,2\n", "remove the lines above"),
         ("t x y z\n0 1 2 3\n", '"t x y z", has neither commas'),
         ("t|x|y|z\n0|1|2|3\n", "between its columns"),
-        ("t,x\n0,1\n", "columns are t, x; choose some of them with --map"),
+        ("t,x\n0,1\n", "columns are t, x; choose some of them with columns"),
     ],
 )
 def test_files_without_a_header_are_named_with_a_remedy(tmp_path, text, remedy):

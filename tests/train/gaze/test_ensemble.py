@@ -110,7 +110,7 @@ def test_an_interrupted_ensemble_resumes(threads, tmp_path):
         if state.stage == "2/3 fit" and state.steps == 2:
             raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt, match="2.*3.*--resume"):
+    with pytest.raises(KeyboardInterrupt, match="2.*3.*resume"):
         together(path=path, on_progress=stop)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.member0.safetensors", "a.run"]
     with pytest.raises(NergError, match="started with different probes"):
@@ -162,9 +162,9 @@ def test_an_ensemble_that_cannot_be_written_is_saved(threads, tmp_path):
     path, stages = tmp_path / "a.run", []
 
     def refuse(field, provenance):
-        raise NergError("a weight does not fit into fp16; leave out --half")
+        raise NergError("a weight does not fit into fp16; leave out half")
 
-    with pytest.raises(NergError, match="fp16.*--resume"):
+    with pytest.raises(NergError, match="fp16.*resume"):
         together(path=path, write=refuse)
     members = sorted(p.name for p in tmp_path.iterdir())
     assert members == [f"a.member{k}.safetensors" for k in range(3)]

@@ -233,13 +233,13 @@ def test_unsupported_options_are_refused(name, takes):
     if takes:
         recipe.check_options(["loss", "semantic", "init"])
         return
-    with pytest.raises(NergError, match="does not support --loss, --init field; add --recipe small"):
+    with pytest.raises(NergError, match='does not support loss, init="field"; add recipe="small"'):
         recipe.check_options(["loss", "init"])
 
 
 def test_features_and_weights_are_those_of_a_radiance_field():
     for wrong in ({"init_from_field": True}, {"options": FieldOptions(semantic="snapshot")}):
-        with pytest.raises(NergError, match="needs a radiance field; pass one with --field"):
+        with pytest.raises(NergError, match="needs a radiance field; pass one with field"):
             get_recipe("small").make_plan(SCENE, **wrong)
 
 

@@ -286,7 +286,7 @@ def test_damping_near_cameras(dataset):
 
 
 def test_a_box_outside_all_views_is_refused(dataset):
-    with pytest.raises(ValueError, match="--aabb"):
+    with pytest.raises(ValueError, match="aabb"):
         RadianceTrainer(dataset.train, Box((50, 50, 50), (51, 51, 51)), TINY, settings(), ns)
 
 
