@@ -189,7 +189,7 @@ class ViewScores(ResultTables):
     def rows(self) -> list[dict]:
         """One row per view; the ``note`` says why scores are missing."""
         columns = self.views, self.psnr, self.ssim, self.psnr_fitted
-        rows = [dict(zip(("view", "psnr", "ssim", "psnr_fitted"), row)) for row in zip(*columns)]
+        rows: list[dict[str, Any]] = [dict(zip(("view", "psnr", "ssim", "psnr_fitted"), row)) for row in zip(*columns)]
         add_notes(rows, lambda row, column: (column, _NO_SCORE.get(column, "")))
         return rows
 
