@@ -58,7 +58,7 @@ class ListedCommand:
 
 def find_commands() -> dict[str, ListedCommand]:
     """Return all commands by name, in the order of the list. Imports no module."""
-    commands = {row.name: ListedCommand(row.line, "") for row in TABLE}
+    commands = {row.name: ListedCommand(row.line, row.function.partition(":")[0]) for row in TABLE}
     for package in PACKAGES:
         for folder in map(Path, importlib.import_module(package).__path__):
             for path in sorted(folder.rglob("*.py")):

@@ -1,7 +1,13 @@
-"""Commands from the signatures of functions: arguments, options, ranges, defaults and help texts."""
+"""Commands from the signatures of functions: arguments, options, ranges, defaults and help texts.
+
+A signature is read from the source, so that help and completion do not import what the function computes with.
+"""
 
 from __future__ import annotations
 
+import ast
+import builtins
+import importlib.util
 import inspect
 import re
 from collections.abc import Callable
@@ -10,7 +16,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, get_type_hints
 
-from nerg_mi.files.atomic import check_writable
 from nerg_mi.options import MAIN, TRAINING, cpu_threads, llvm_variant, option
 from nerg_mi.progress import Reporter
 from nerg_mi.ranges import RANGE, find_ranges
@@ -18,12 +23,15 @@ from nerg_mi.workflows.base import Command, argument, import_function, out, sele
 
 from .table import Row
 
+_FILE = "FilePath"
+"""Part of the annotation of parameters that may be files."""
+
 _DEVICE = {"threads": ("int | None", cpu_threads()), "mode": ("str", llvm_variant())}
 
 
 def make_command(row: Row) -> Command:
     """Return the command of a ``row``."""
-    function = import_function(row.function)
+    function = read_signature(row.function)
     parameters, texts = inspect.signature(function).parameters, read_parameter_texts(function)
     kinds = {name: _find_kind(function, name) for name in parameters if name != "progress"}
     arguments = {
@@ -45,6 +53,8 @@ def make_command(row: Row) -> Command:
     def run(*, options: Any, reporter: Reporter, **values: Any) -> None:
         output = values.pop("output") if row.output else None
         if output is not None:
+            from nerg_mi.files.atomic import check_writable  # which imports NumPy
+
             check_writable(output, *row.suffixes)
         if row.computes:
             select_backend(options.mode, options.threads)
@@ -52,7 +62,7 @@ def make_command(row: Row) -> Command:
         for name, kind in settings.items():
             shown = [f.name for f in fields(kind) if hasattr(options, f.name)]
             chosen[name] = kind(**{field: getattr(options, field) for field in shown})
-        result = function(**values, **chosen, progress=reporter)
+        result = import_function(row.function)(**values, **chosen, progress=reporter)
         if output is not None:
             result.save(output)
             reporter.message(f"wrote {output} ({output.stat().st_size / 1e6:.1f} MB)")
@@ -65,6 +75,35 @@ def _repeat(setting: Field[Any]) -> Any:
     """Return the option of a field of settings."""
     names = setting.metadata["names"]
     return option(setting.default, setting.metadata["help"], *names, within=setting.metadata[RANGE], group=TRAINING)
+
+
+def read_signature(path: str) -> Callable[..., Any]:
+    """Return a function with the signature and the docstring of "MODULE:FUNCTION", and without its body.
+
+    Of the imports of the module, only those run that its defaults and ranges use. If these use names that the module
+    defines itself, it is imported.
+    """
+    module, _, name = path.partition(":")
+    spec = importlib.util.find_spec(module)
+    assert spec is not None and spec.origin is not None
+    body = ast.parse(Path(spec.origin).read_text(encoding="utf-8")).body
+    (node,) = (n for n in body if isinstance(n, ast.FunctionDef) and n.name == name)
+    node.body, node.decorator_list, node.returns = node.body[:1], [], None
+    arguments = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
+    hints = [a.annotation for a in arguments if a.annotation is not None and _FILE not in ast.unparse(a.annotation)]
+    parts = [*hints, *node.args.defaults, *filter(None, node.args.kw_defaults)]
+    used = {n.id for part in parts for n in ast.walk(part) if isinstance(n, ast.Name)}
+    imports = [n for n in body if isinstance(n, ast.ImportFrom) and used & {a.asname or a.name for a in n.names}]
+    imported = {a.asname or a.name for n in imports for a in n.names}
+    if used - imported - vars(builtins).keys():
+        return import_function(path)
+    for statement in imports:
+        statement.names = [a for a in statement.names if (a.asname or a.name) in used | {"annotations"}]
+    future = ast.ImportFrom("__future__", [ast.alias("annotations")], 0)
+    code = ast.fix_missing_locations(ast.Module([future, *imports, node], []))
+    names: dict[str, Any] = {"__name__": module, "__package__": module.rpartition(".")[0]}
+    exec(compile(code, spec.origin, "exec"), names)
+    return names[name]
 
 
 def read_parameter_texts(function: Callable[..., Any]) -> dict[str, str]:
@@ -82,7 +121,7 @@ def read_parameter_texts(function: Callable[..., Any]) -> dict[str, str]:
 def _find_kind(function: Callable[..., Any], name: str) -> Any:
     """Return the type of a parameter on the command line: `Path` if it may be a file, else that of the annotation."""
     annotation = str(function.__annotations__[name])
-    if "FilePath" in annotation:
+    if _FILE in annotation:
         return list[Path] if "Sequence" in annotation else Path
     names: Any = inspect.unwrap(function)
     return get_type_hints(SimpleNamespace(__annotations__={name: annotation}), names.__globals__)[name]
