@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from .rays.readers.registry import register_reader
     from .train.compile import compile_field
     from .train.gaze_recipes import register_recipe
+    from .train.refine import refine_field
     from .transport.quadrature import register_quadrature
     from .viewer.serve import view
 
@@ -87,6 +88,7 @@ _MODULES = {
     "next_look": "nerg_mi.api.evaluation",
     "observe": "nerg_mi.api.query",
     "plot_rays": "nerg_mi.api.recordings",
+    "refine_field": "nerg_mi.train.refine",
     "register_quadrature": "nerg_mi.transport.quadrature",
     "register_reader": "nerg_mi.rays.readers.registry",
     "register_recipe": "nerg_mi.train.gaze_recipes",
@@ -134,6 +136,7 @@ __all__ = [
     "next_look",
     "observe",
     "plot_rays",
+    "refine_field",
     "register_quadrature",
     "register_reader",
     "register_recipe",

@@ -98,7 +98,6 @@ def _shown(value: object) -> str:
 def registered() -> str:
     """The extension points with their registered entries."""
     _choose_variant()
-    from nerg_mi.fields import encoding as encodings
     from nerg_mi.fields import gaze_base as gaze_fields
     from nerg_mi.measures.tables import MEASURES_BY_NAME
     from nerg_mi.rays.readers.registry import list_reader_names
@@ -108,7 +107,6 @@ def registered() -> str:
     from nerg_mi.transport.quadrature import RULES
 
     rows = (
-        ("encoding of positions", "nerg_mi/fields/encoding.py", encodings.kinds()),
         ("gaze field", "nerg_mi/fields/gaze_base.py", gaze_fields.kinds()),
         ("quadrature rule", "nerg_mi/transport/quadrature.py", RULES.names()),
         ("depth", "nerg_mi/transport/depth.py", DEPTHS.names()),

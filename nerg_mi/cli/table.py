@@ -28,6 +28,14 @@ class Row:
 
 TABLE = (
     Row(
+        "refine",
+        "nerg_mi.train.refine:refine_field",
+        "Compute a finer occupancy grid of a radiance field, so that it renders faster.",
+        ("field",),
+        "Radiance field to write (.safetensors).",
+        (".safetensors",),
+    ),
+    Row(
         "compile",
         "nerg_mi.train.compile:compile_field",
         "Evaluate the density of a radiance field on voxels once, so that it renders faster.",

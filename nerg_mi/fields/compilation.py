@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable
 
@@ -98,18 +99,8 @@ def bound_voxel_bytes(field: RadianceField, resolution: int) -> int:
 
 def attach_voxels(field: RadianceField, voxels: VoxelGrid) -> RadianceField:
     """A compiled field with the networks of ``field``, and ``voxels``, which `compile_density` made of it."""
-    compiled = RadianceField(
-        field.config,
-        field.box,
-        field.grid,
-        field.density_net,
-        field.color_net,
-        occupancy_of_voxels(field, voxels) or field.occupancy,
-        field.color_space,
-        field.march_step,
-        field.background,
-        field.march_growth,
-    )
+    compiled = copy.copy(field)
+    compiled.occupancy = occupancy_of_voxels(field, voxels) or field.occupancy
     compiled.voxels = voxels
     return compiled
 

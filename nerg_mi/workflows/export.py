@@ -9,11 +9,10 @@ from pathlib import Path
 
 from nerg_mi.errors import NergError, parameter
 from nerg_mi.fields.gaze_base import AnyGazeField
-from nerg_mi.fields.occupancy import RefinedGrid, refine_occupancy
+from nerg_mi.fields.occupancy import refine_occupancy
 from nerg_mi.fields.radiance import RadianceField
-from nerg_mi.files.atomic import check_writable, file_sha256
-from nerg_mi.formats.checkpoint import read_checkpoint, write_checkpoint
-from nerg_mi.formats.fields import encode_occupancy, load_radiance, save_gaze, save_radiance
+from nerg_mi.files.atomic import check_writable
+from nerg_mi.formats.fields import load_radiance, save_gaze, save_radiance
 from nerg_mi.formats.splats import make_splats, write_ply_splats
 from nerg_mi.formats.surfaces import (
     Surface,
@@ -39,7 +38,6 @@ from .radiance_commands import (
     CheckpointImportOptions,
     MeshOptions,
     PointOptions,
-    RefineOptions,
     SplatOptions,
     TorchNgpOptions,
     VolumeOptions,
@@ -299,51 +297,3 @@ def _by(shape) -> str:
 
 def _corner(values) -> str:
     return "(" + ", ".join(f"{v:.4g}" for v in values) + ")"
-
-
-# ---- A finer occupancy grid, for checkpoints without one ----
-
-
-@dataclass(frozen=True)
-class Refinement:
-    """The finer ``occupancy`` grid, the occupied fraction ``before``, and the written file."""
-
-    occupancy: RefinedGrid
-    before: float
-    output: Path
-
-
-def refine_checkpoint(
-    field: str | Path, output: str | Path, options: RefineOptions | None = None, reporter: Reporter = SILENT
-) -> Refinement:
-    """Write the radiance field in ``field`` to ``output`` with a finer occupancy grid, otherwise unchanged.
-
-    The new file stores the checksum of the old one, so that gaze fields that were trained in it accept the new file.
-    Raises `NergError` for errors that the user can correct.
-    """
-    options, field, output, start = options or RefineOptions(), Path(field), Path(output), time.perf_counter()
-    check_writable(output, ".safetensors")
-    ns = select_backend(options.mode)
-    loaded, _ = load_radiance(field, ns)
-    if loaded.occupancy is None:
-        raise NergError(f'"{field}" has no occupancy grid to refine: rays are marched through its whole box')
-    reporter.progress(0.0, f"refining {field.name}")
-    before, grid = loaded.occupancy.coarse.occupied_fraction, refine_occupancy(loaded)
-    if grid is None:
-        raise NergError(
-            f'the occupancy grid of "{field}" consists of nested cubes, which cannot be refined: use the field as it is'
-        )
-    tensors, meta = read_checkpoint(field, "radiance")
-    arrays, grid_metadata = encode_occupancy(grid)
-    origin = meta.get("refined_from") or file_sha256(field)
-    metadata = {key: value for key, value in meta.items() if key not in ("format", "kind")}
-    write_checkpoint(
-        output, "radiance", tensors | arrays, metadata | {"occupancy": grid_metadata, "refined_from": origin}
-    )
-    reporter.message(
-        f"occupied: {100 * grid.occupied_fraction:.2f} % of the box, before {100 * before:.2f} %; a random line "
-        f"misses an optical depth of {grid.missed_optical_depth:.1e}"
-    )
-    seconds = time.perf_counter() - start
-    reporter.message(f"wrote {output} ({output.stat().st_size / 1e6:.1f} MB) in {seconds:.1f} s")
-    return Refinement(grid, before, output)

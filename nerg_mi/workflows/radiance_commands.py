@@ -8,7 +8,6 @@
 ``nerg export volume``: Sample density and colour on a grid, as Mitsuba grid volumes (.vol).
 ``nerg export scene``: Write a scene with its gaze for Rerun (.rrd) or OpenUSD (.usdc, .usda).
 ``nerg export torch-ngp``: Write a torch-ngp checkpoint (.pth), for fields whose grid and networks fit its layout.
-``nerg refine``: Compute a finer occupancy grid of a radiance field, so that it renders faster.
 
 Options of these commands. The workflows are in `.poses`, `.train_radiance` and `.export`.
 """
@@ -268,13 +267,6 @@ class CheckpointImportOptions(ValidatedDataclass):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RefineOptions(ValidatedDataclass):
-    """Options of ``nerg refine``."""
-
-    mode: str = llvm_variant()
-
-
-@dataclass(frozen=True, kw_only=True)
 class LatticeOptions(ValidatedDataclass):
     """The grid on which a radiance field is sampled."""
 
@@ -457,15 +449,4 @@ declare(
     options=TorchNgpOptions,
     field=_FIELD,
     output=out("Checkpoint to write (.pth)."),
-)
-
-declare(
-    "refine",
-    "nerg_mi.workflows.export:refine_checkpoint",
-    "Compute a finer occupancy grid of a radiance field, so that it renders with fewer evaluations.",
-    more="Training and nerg import compute this grid already; the command is for older files. The weights do not "
-    "change, and gaze fields that were trained in the field accept the new file.",
-    options=RefineOptions,
-    field=_FIELD,
-    output=out("Radiance field to write (.safetensors)."),
 )

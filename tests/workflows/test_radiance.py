@@ -15,7 +15,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from nerg_mi.environment.environment import load_field_geometry
-from nerg_mi.environment.trained import TrainedField
+from nerg_mi.environment.trained import TrainedField, load_field
 from nerg_mi.errors import NergError
 from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid
 from nerg_mi.fields.radiance import RadianceField
@@ -31,6 +31,7 @@ from nerg_mi.train import compile as compilation
 from nerg_mi.train.compile import compile_field
 from nerg_mi.train.radiance_run import train_field
 from nerg_mi.train.radiance_settings import RadianceSettings
+from nerg_mi.train.refine import refine_field
 from nerg_mi.workflows import poses as job
 from nerg_mi.workflows import train_radiance as training
 from nerg_mi.workflows.export import (
@@ -42,7 +43,6 @@ from nerg_mi.workflows.export import (
     export_splats,
     export_volume,
     import_checkpoint,
-    refine_checkpoint,
 )
 from nerg_mi.workflows.poses import STAGES, find_poses
 from nerg_mi.workflows.radiance_commands import (
@@ -221,12 +221,13 @@ def files(tmp_path_factory):
     folder = tmp_path_factory.mktemp("refined")
     bits = np.random.default_rng(0).random((6, 6, 6)) < 0.4
     radiance(folder / "old.safetensors", density_scale=8e-3, occupancy=OccupancyGrid(bits, ns, 0.05))
-    result = refine_checkpoint(folder / "old.safetensors", folder / "new.safetensors")
-    return folder / "old.safetensors", folder / "new.safetensors", result
+    result = refine_field(folder / "old.safetensors")
+    result.save(folder / "new.safetensors")
+    return folder / "old.safetensors", folder / "new.safetensors", result.network.occupancy
 
 
 def test_refinement_changes_only_the_bound(files):
-    old, new, result = files
+    old, new, grid = files
     (tensors, meta), (again, refined_meta) = (read_checkpoint(p, "radiance") for p in (old, new))
     assert set(again) - set(tensors) == {"occupancy.parts"}
     assert all(
@@ -238,11 +239,8 @@ def test_refinement_changes_only_the_bound(files):
     # Readers without refinement see the original cells.
     assert {k: v for k, v in refined_meta["occupancy"].items() if k != "refined"} == meta["occupancy"]
     loaded = load_radiance(new, ns)[0].occupancy
-    assert (
-        np.array_equal(loaded.masks, result.occupancy.masks)
-        and loaded.missed_optical_depth == result.occupancy.missed_optical_depth
-    )
-    assert 0 < loaded.occupied_fraction < result.before == loaded.coarse.occupied_fraction
+    assert np.array_equal(loaded.masks, grid.masks) and loaded.missed_optical_depth == grid.missed_optical_depth
+    assert 0 < loaded.occupied_fraction < loaded.coarse.occupied_fraction
 
 
 def test_a_gaze_field_accepts_the_refined_checkpoint(files, tmp_path):
@@ -250,8 +248,18 @@ def test_a_gaze_field_accepts_the_refined_checkpoint(files, tmp_path):
     checksum = file_sha256(old)
     assert matches_checksum(old, checksum) and matches_checksum(new, checksum)
     assert not matches_checksum(new, "0" * 64) and not matches_checksum(new, None)
-    refine_checkpoint(new, tmp_path / "again.safetensors")
+    refine_field(new).save(tmp_path / "again.safetensors")
     assert (tmp_path / "again.safetensors").read_bytes() == new.read_bytes()
+
+
+def test_refinement_keeps_the_object_and_half_precision(files, tmp_path):
+    field = load_field(files[0])
+    field.save(tmp_path / "half.safetensors", half=True)
+    half = load_field(tmp_path / "half.safetensors")
+    refine_field(half).save(tmp_path / "new.safetensors")
+    assert isinstance(half.network.occupancy, OccupancyGrid)
+    new, old = (read_checkpoint(path, "radiance")[0] for path in (tmp_path / "new.safetensors", half.path))
+    assert all(np.array_equal(new[name], old[name]) and new[name].dtype == old[name].dtype for name in old)
 
 
 def test_new_weights_discard_the_refinement(files):
@@ -268,8 +276,7 @@ def test_new_weights_discard_the_refinement(files):
 def test_fields_without_an_occupancy_grid_are_refused(tmp_path, occupancy, what):
     radiance(tmp_path / "f.safetensors", occupancy=occupancy)
     with pytest.raises(NergError, match=what):
-        refine_checkpoint(tmp_path / "f.safetensors", tmp_path / "g.safetensors")
-    assert not (tmp_path / "g.safetensors").exists()
+        refine_field(tmp_path / "f.safetensors")
 
 
 # ---- Poses of photos ----
