@@ -87,7 +87,8 @@ def align(
     _report_notes(fit, reporter)
     rejection = _rejection_reason(fit, options)
     if rejection and not options.force:
-        raise NergError(f"{rejection}; or add {parameter('force', True)} to write it anyway")
+        kind = "mirrored" if fit.mirrored is not None else ""
+        raise NergError(f"{rejection}; or add {parameter('force', True)} to write it anyway", kind=kind)
     files = {name: _identity(path) for name, path in _sources(rays, options).items()}
     result = Alignment.from_fit(evidence.kind, fit, files, bool(rejection))
     _report_alignment(result, reporter)
