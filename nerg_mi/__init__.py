@@ -30,7 +30,6 @@ if TYPE_CHECKING:
         draw,
         export,
         export_scene,
-        find_poses,
         import_checkpoint,
         render_film,
         report,
@@ -53,6 +52,7 @@ if TYPE_CHECKING:
     from .rays.readers.registry import register_reader
     from .train.compile import compile_field
     from .train.gaze_recipes import register_recipe
+    from .train.poses import find_poses
     from .train.refine import refine_field
     from .transport.quadrature import register_quadrature
     from .viewer.serve import view
@@ -76,7 +76,7 @@ _MODULES = {
     "export": "nerg_mi.api.analysis",
     "export_scene": "nerg_mi.api.analysis",
     "filter_rays": "nerg_mi.api.recordings",
-    "find_poses": "nerg_mi.api.analysis",
+    "find_poses": "nerg_mi.train.poses",
     "folds": "nerg_mi.api.evaluation",
     "guess": "nerg_mi.api.recordings",
     "import_checkpoint": "nerg_mi.api.analysis",

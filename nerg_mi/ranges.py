@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import dataclasses
 import functools
 import inspect
@@ -157,11 +158,13 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def check_ranges(function: Function) -> Function:
-    """Decorator: check numbers of annotated parameters, as ``Annotated[float, LENGTHS]``, before ``function`` runs.
+    """Decorator: check annotated parameters, as ``Annotated[float, LENGTHS]`` or ``Literal[...]``, before ``function``
+    runs.
 
     A concentration (`KAPPAS`) may be text with an angle (`parse_kappa`).
     """
     signature = inspect.signature(function)
+    choices = find_choices(function)
 
     @functools.wraps(function)
     def call(*args: Any, **keywords: Any) -> Any:
@@ -172,6 +175,10 @@ def check_ranges(function: Function) -> Function:
                 bound.arguments[name] = parse_kappa(value, parameter(name))
             elif value is not None or (name in bound.arguments and "None" not in function.__annotations__[name]):
                 check_number(value, allowed, parameter(name), "[int," in function.__annotations__[name])
+        for name, allowed in choices.items():
+            if (value := bound.arguments.get(name, allowed[0])) not in allowed:
+                names = " or ".join(f'"{choice}"' for choice in allowed)
+                raise NergError(f"{parameter(name)} must be {names}, got {sanitize(repr(value), 60)}")
         return function(*bound.args, **bound.kwargs)
 
     return cast("Function", call)
@@ -189,6 +196,12 @@ def find_ranges(function: Callable[..., Any]) -> dict[str, Range]:
         notes = [note for part in (hint, *get_args(hint)) for note in getattr(part, "__metadata__", ())]
         ranges[name] = next(note for note in notes if isinstance(note, Range))
     return ranges
+
+
+def find_choices(function: Callable[..., Any]) -> dict[str, tuple[str, ...]]:
+    """Return the values of parameters of ``function`` that are annotated as ``Literal["a", "b"]``, by name."""
+    annotations = {k: text for k, text in function.__annotations__.items() if str(text).startswith("Literal[")}
+    return {name: ast.literal_eval(f"{text.removeprefix('Literal')[1:-1]},") for name, text in annotations.items()}
 
 
 class ValidatedDataclass:

@@ -18,7 +18,6 @@ from nerg_mi.workflows.radiance_commands import (
     CheckpointImportOptions,
     MeshOptions,
     PointOptions,
-    PoseOptions,
     SceneExportOptions,
     SplatOptions,
     TorchNgpOptions,
@@ -42,7 +41,6 @@ if TYPE_CHECKING:
     from nerg_mi.workflows.bake_splats import SplatBake
     from nerg_mi.workflows.export import Export
     from nerg_mi.workflows.export_scene import SceneExport
-    from nerg_mi.workflows.poses import PosesResult
     from nerg_mi.workflows.report import ReportResult
 
 
@@ -553,55 +551,3 @@ def import_checkpoint(
         None if fields.field is None else TrainedField(fields.field, fields.origin, path.name),
         None if fields.gaze is None else TrainedGazeField(fields.gaze, fields.origin, path.name),
     )
-
-
-def find_poses(
-    pictures: FilePath,
-    output: FilePath,
-    *,
-    options: PoseOptions | None = None,
-    progress: Progress = None,
-    **overrides: Any,
-) -> PosesResult:
-    """Estimate the poses of photos or of a video, for `train_radiance`.
-
-    Parameters
-    ----------
-    pictures : path
-        A folder of photos, or a video.
-    output : path
-        Folder to write, which becomes the ``photos`` of `train_radiance`.
-    options : PoseOptions, optional
-        Base options (`nerg_mi.workflows.radiance_commands.PoseOptions`).
-    progress : bool, Reporter or None
-        None shows a progress bar in notebooks, True shows one anywhere, False none; a `Reporter` receives everything.
-    **overrides
-        Single options on top of ``options``.
-
-    Returns
-    -------
-    PosesResult
-        The written folder (``output``), the photos with and without a pose, and the error in pixels.
-
-    Raises
-    ------
-    NergError
-        The photos do not show one scene, or an option is invalid.
-    ImportError
-        pycolmap, or for a video PyAV, is not installed.
-
-    Examples
-    --------
-    >>> import nerg_mi as nerg
-    >>> try:
-    ...     nerg.find_poses(folder / "nowhere", folder / "posed")
-    ... except nerg.NergError as error:
-    ...     print("nowhere" in str(error))
-    True
-    """
-    from nerg_mi.workflows.poses import find_poses as estimate
-
-    check_output(output)
-    with report_progress(progress) as reporter:
-        resolved = build_options(PoseOptions, "find_poses", options, overrides)
-        return estimate(resolve_file(pictures, "pictures"), Path(output), resolved, reporter)

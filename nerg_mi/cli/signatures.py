@@ -26,6 +26,7 @@ from .table import Row
 _FILE = "FilePath"
 """Part of the annotation of parameters that may be files."""
 
+_EMPTY = inspect.Parameter.empty
 _DEVICE = {"threads": ("int | None", cpu_threads()), "mode": ("str", llvm_variant())}
 
 
@@ -35,10 +36,13 @@ def make_command(row: Row) -> Command:
     parameters, texts = inspect.signature(function).parameters, read_parameter_texts(function)
     kinds = {name: _find_kind(function, name) for name in parameters if name != "progress"}
     arguments = {
-        name: argument(texts[name], kinds[name], required=parameters[name].default is inspect.Parameter.empty)
-        for name in row.arguments
+        name: argument(texts[name], kinds[name], required=parameters[name].default is _EMPTY) for name in row.arguments
     }
-    arguments |= {"output": out(row.output)} if row.output else {}
+    writes = "output" in parameters
+    if writes:
+        arguments["output"] = out(texts["output"], default=... if parameters["output"].default is _EMPTY else None)
+    elif row.output:
+        arguments["output"] = out(row.output)
     members, settings, ranges = list[Any](), dict[str, Any](), find_ranges(function)
     for name in (name for name in kinds if name not in arguments):
         default = parameters[name].default
@@ -51,7 +55,7 @@ def make_command(row: Row) -> Command:
     options = make_dataclass("Options", members, frozen=True, kw_only=True)
 
     def run(*, options: Any, reporter: Reporter, **values: Any) -> None:
-        output = values.pop("output") if row.output else None
+        output = values.pop("output") if row.output and not writes else None
         if output is not None:
             from nerg_mi.files.atomic import check_writable  # which imports NumPy
 
@@ -121,6 +125,8 @@ def read_parameter_texts(function: Callable[..., Any]) -> dict[str, str]:
 def _find_kind(function: Callable[..., Any], name: str) -> Any:
     """Return the type of a parameter on the command line: `Path` if it may be a file, else that of the annotation."""
     annotation = str(function.__annotations__[name])
+    if annotation.startswith("Literal["):  # checked by the function
+        return str
     if _FILE in annotation:
         return list[Path] if "Sequence" in annotation else Path
     names: Any = inspect.unwrap(function)

@@ -14,7 +14,8 @@ class Row:
     """A command: words after ``nerg``, "MODULE:FUNCTION" that it calls, and its line in lists of commands.
 
     ``arguments`` are the parameters without a flag, in order. ``output`` is the help of ``--output``, to which the
-    result is saved, and ``suffixes`` are those of this file. A command that ``computes`` has ``--mode``.
+    result is saved, and ``suffixes`` are those of this file; a function that writes during its work has a parameter
+    ``output`` in place of it. A command that ``computes`` has ``--mode``.
     """
 
     name: str
@@ -27,6 +28,13 @@ class Row:
 
 
 TABLE = (
+    Row(
+        "poses",
+        "nerg_mi.train.poses:find_poses",
+        "Estimate the camera poses of photos or video frames.",
+        ("pictures",),
+        computes=False,
+    ),
     Row(
         "refine",
         "nerg_mi.train.refine:refine_field",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import inspect
 import io
 import json
 import math
@@ -148,7 +149,7 @@ def make_provenance(
     seed
         Seed of the random numbers.
     settings
-        A mapping, or a dataclass of options, of which those with non-default values are recorded.
+        A mapping (`changed_arguments`), or a dataclass of options, of which those with non-default values are recorded.
     checksums
         Cache of checksums by path, which is extended.
     """
@@ -199,6 +200,16 @@ def _changed_options(settings: Any) -> dict[str, Any]:
         return dict(settings)
     all_options = {f.name: (getattr(settings, f.name), f.default) for f in fields(settings)}
     return {name: value for name, (value, default) in all_options.items() if value != default and value is not None}
+
+
+def changed_arguments(function: Callable[..., Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the ``values`` of optional parameters of ``function`` that are neither None nor the default, by name."""
+    defaults = {name: p.default for name, p in inspect.signature(function).parameters.items() if name != "progress"}
+    return {
+        name: values[name]
+        for name, default in defaults.items()
+        if default is not inspect.Parameter.empty and values[name] is not None and values[name] != default
+    }
 
 
 def _to_json(value: Any) -> Any:

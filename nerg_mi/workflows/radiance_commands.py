@@ -1,5 +1,4 @@
-"""``nerg poses``: Estimate the camera poses of photos or video frames.
-``nerg train radiance``: Train a radiance field on posed photos and report the error on held-out views.
+"""``nerg train radiance``: Train a radiance field on posed photos and report the error on held-out views.
 ``nerg eval radiance``: Score a radiance field on held-out views: PSNR, SSIM and, where it is known, depth error.
 ``nerg import``: Convert checkpoints of torch-ngp and of the NeRG paper's authors.
 ``nerg export mesh``: Extract a mesh with vertex colours by marching cubes (.ply, .glb).
@@ -9,7 +8,7 @@
 ``nerg export scene``: Write a scene with its gaze for Rerun (.rrd) or OpenUSD (.usdc, .usda).
 ``nerg export torch-ngp``: Write a torch-ngp checkpoint (.pth), for fields whose grid and networks fit its layout.
 
-Options of these commands. The workflows are in `.poses`, `.train_radiance` and `.export`.
+Options of these commands. The workflows are in `.train_radiance` and `.export`.
 """
 
 from __future__ import annotations
@@ -42,59 +41,6 @@ from nerg_mi.train.radiance_settings import RadianceSettings
 from .base import argument, declare, extra, out
 
 # ---- From photos to a field ----
-
-
-@dataclass(frozen=True, kw_only=True)
-class PoseOptions(ValidatedDataclass):
-    """Options of ``nerg poses``."""
-
-    num_frames: int = option(
-        80,
-        "Number of frames taken from a video; each is the sharpest of an equally long interval.",
-        within=Range(3, 10**6),
-        group=INPUT,
-    )
-    max_image_size: int = option(
-        960,
-        "Length in pixels of the longer side to which images are reduced for feature extraction.",
-        within=Range(64, 65536),
-        group=PERFORMANCE,
-    )
-    matching: str = option(
-        "auto",
-        "Which image pairs are matched: exhaustive (all pairs), sequential (neighbours), or auto (exhaustive up to 100 "
-        "images, else sequential).",
-        group=PERFORMANCE,
-    )
-    camera_model: str = option(
-        "auto",
-        "Lens parameters that are estimated: radial (f, k1), opencv (fx, fy, k1, k2, p1, p2), or auto (opencv from 10 "
-        "photos on, else radial).",
-        group=MODEL,
-    )
-    single_camera: bool = option(
-        True,
-        "Share one camera among photos of equal size, and of equal maker, model and focal length if these are stored; "
-        "else each photo has its own.",
-        group=MODEL,
-    )
-    allow_outside: bool = option(False, "Follow links that lead outside the folder of photos.", group=INPUT)
-    orient: bool = option(
-        True, "Rotate the scene so that up is +z, estimated from the cameras and a floor plane.", group=OUTPUT
-    )
-    seed: int = random_seed("feature matching and reconstruction")
-    threads: int | None = cpu_threads()
-
-
-declare(
-    "poses",
-    "nerg_mi.workflows.poses:find_poses",
-    "Estimate the camera poses of photos or video frames, and write them as a folder for nerg train radiance.",
-    more='Needs pycolmap, and PyAV for videos: pip install "nerg-mi[poses]".',
-    options=PoseOptions,
-    pictures=argument("Folder of photos (JPEG, PNG), or a video.", metavar="PHOTOS|VIDEO"),
-    output=out("Folder to create: photos with their poses."),
-)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import pytest
 import typer
@@ -163,6 +163,7 @@ def play(
     times: Annotated[int, Range(1, 9)] = 1,
     width: Annotated[float, KAPPAS] | None = None,
     is_quiet: bool = False,
+    tone: Literal["high", "low"] = "high",
     note: Note = Note(),
     progress: Progress = None,
 ):
@@ -180,6 +181,8 @@ def play(
         How wide.
     is_quiet : bool
         Whether nothing is heard.
+    tone : str
+        Which tone: high or low.
     note : Note
         The note.
     progress : bool, Reporter or None
@@ -187,6 +190,21 @@ def play(
     """
     progress.message(f"{[str(name) for name in names]} {times} {width} {is_quiet} {note.volume}")
     return note
+
+
+def record(names: Sequence[FilePath], output: FilePath, *, progress: Progress = None):
+    """Record notes.
+
+    Parameters
+    ----------
+    names : sequence of path
+        What is recorded.
+    output : path
+        Folder to write.
+    progress : bool, Reporter or None
+        Progress.
+    """
+    Path(output).mkdir()
 
 
 def test_a_command_is_one_row(monkeypatch, tmp_path, capsys):
@@ -214,11 +232,25 @@ def test_a_command_is_one_row(monkeypatch, tmp_path, capsys):
     assert (tmp_path / "a.txt").read_text() == "11"
     assert nerg("a", *output, "--times", "10")[0] == 2 and nerg("a", *output, "--volume", "12")[0] == 2
     assert nerg("a", "-o", str(tmp_path / "a.png"))[0] == 1
+    code, said = nerg("a", *output, "--tone", "middle")
+    assert code == 1 and all(text in said for text in ("--tone", '"high"', '"low"', "middle"))
     with pytest.raises(NergError) as error:
         play(["a"], times=2.5)
     assert error.value.parameters == {"times": ""}
     with pytest.raises(NergError):
         play(["a"], times=None)
+
+
+def test_a_function_with_an_output_writes_during_its_work(monkeypatch, tmp_path, capsys):
+    row = Row("record", f"{__name__}:record", "Record.", ("names",), computes=False)
+    monkeypatch.setitem(ROWS, "record", row)
+    monkeypatch.setattr(building, "TABLE", (row,))
+    with pytest.raises(SystemExit) as end:
+        nerg_mi.cli.main(["record", "a", "-o", str(tmp_path / "notes")])
+    assert not end.value.code and (tmp_path / "notes").is_dir() and "wrote" not in capsys.readouterr().out
+    with pytest.raises(SystemExit) as end:
+        nerg_mi.cli.main(["record", "a"])
+    assert end.value.code == 2
 
 
 def test_a_command_line_without_a_command_is_refused(monkeypatch, tmp_path, capsys):

@@ -27,8 +27,8 @@ from nerg_mi.tasks import cluster
 from nerg_mi.tasks.engines import LocalEngine, run_plan
 from nerg_mi.tasks.store import Store
 from nerg_mi.threads import THREADS_VARIABLE
+from nerg_mi.train import poses as posing
 from nerg_mi.workflows import demo
-from nerg_mi.workflows import poses as posing
 from nerg_mi.workflows.scene_commands import KINDS, DemoOptions
 from tests.aoi.place import people, write_place
 from tests.photos import rendered

@@ -28,11 +28,12 @@ from nerg_mi.photos.colmap import UpEstimate
 from nerg_mi.photos.dataset import open_dataset
 from nerg_mi.photos.structure import Reconstruction
 from nerg_mi.train import compile as compilation
+from nerg_mi.train import poses as job
 from nerg_mi.train.compile import compile_field
+from nerg_mi.train.poses import STAGES, find_poses
 from nerg_mi.train.radiance_run import train_field
 from nerg_mi.train.radiance_settings import RadianceSettings
 from nerg_mi.train.refine import refine_field
-from nerg_mi.workflows import poses as job
 from nerg_mi.workflows import train_radiance as training
 from nerg_mi.workflows.export import (
     PointOptions,
@@ -44,13 +45,7 @@ from nerg_mi.workflows.export import (
     export_volume,
     import_checkpoint,
 )
-from nerg_mi.workflows.poses import STAGES, find_poses
-from nerg_mi.workflows.radiance_commands import (
-    CheckpointImportOptions,
-    PoseOptions,
-    RadianceOptions,
-    RadianceScoreOptions,
-)
+from nerg_mi.workflows.radiance_commands import CheckpointImportOptions, RadianceOptions, RadianceScoreOptions
 from nerg_mi.workflows.train_radiance import evaluate_radiance, train_radiance
 from tests.formats.test_torch_ngp import save_nerg as save
 from tests.formats.test_torch_ngp import small_gaze, small_state
@@ -341,8 +336,8 @@ def finds(monkeypatch):
 def test_the_written_capture_is_readable(photos, finds, tmp_path):
     calls = finds(COUNT)
     recorder = Recorder()
-    options = PoseOptions(camera_model="radial", threads=1, seed=3, single_camera=False)
-    result = find_poses(photos, tmp_path / "new" / "capture", options, recorder)
+    options = dict(camera_model="radial", threads=1, seed=3, single_camera=False)
+    result = find_poses(photos, tmp_path / "new" / "capture", **options, progress=recorder)
     (settings,) = calls
     assert (settings.lens, settings.threads, settings.seed, settings.share_cameras) == ("radial", 1, 3, False)
     assert sorted(os.listdir(result.output)) == ["images", "poses.json", "poses.png", "sparse"]
@@ -363,7 +358,7 @@ def test_the_written_capture_is_readable(photos, finds, tmp_path):
 def test_progress_increases_through_all_stages(photos, finds, tmp_path):
     finds(COUNT)
     recorder = Recorder()
-    find_poses(photos, tmp_path / "capture", None, recorder)
+    find_poses(photos, tmp_path / "capture", progress=recorder)
     shares = [share for share, _ in recorder.steps]
     assert shares == sorted(shares) and 0 < shares[0] < STAGES["features"] and shares[-1] == STAGES["writing"]
     words = " ".join(text for _, text in recorder.steps)
@@ -375,7 +370,7 @@ def test_photos_without_a_pose_are_reported_and_skipped(photos, finds, tmp_path)
     finds(7)
     recorder = Recorder()
     (photos / "bad.jpg").write_bytes(b"\xff\xd8 no photo")
-    result = find_poses(photos, tmp_path / "capture", None, recorder)
+    result = find_poses(photos, tmp_path / "capture", progress=recorder)
     assert result.unregistered == ["7.png", "8.png"] and [u.name for u in result.skipped] == ["bad.jpg"]
     assert sorted(os.listdir(result.output / "images")) == [f"{k}.png" for k in range(7)]
     text = "\n".join(recorder.messages)
@@ -387,7 +382,7 @@ def test_photos_without_a_pose_are_reported_and_skipped(photos, finds, tmp_path)
 def test_few_poses_and_separate_models_cause_warnings(photos, finds, tmp_path):
     finds(4)
     recorder = Recorder()
-    find_poses(photos, tmp_path / "capture", None, recorder)
+    find_poses(photos, tmp_path / "capture", progress=recorder)
     parts, few = recorder.warnings
     assert "unconnected models" in parts and "another has 5 images (4.png, 5.png" in parts
     assert "less than half" in few and "take more images" in few
@@ -398,10 +393,10 @@ def test_an_uncertain_or_disabled_up_direction_is_reported(photos, finds, tmp_pa
 
     recorder = Recorder()
     finds(COUNT, lambda made: replace(made, up=UpEstimate(np.array([0, 0, 1.0]), 40.0)))
-    find_poses(photos, tmp_path / "a", None, recorder)
+    find_poses(photos, tmp_path / "a", progress=recorder)
     assert "disagree on the up direction" in recorder.warnings[0] and "orient=False" in recorder.warnings[0]
     finds(COUNT, lambda made: replace(made, up=None))
-    result = find_poses(photos, tmp_path / "b", PoseOptions(orient=False), recorder)
+    result = find_poses(photos, tmp_path / "b", orient=False, progress=recorder)
     assert "the up direction was not estimated" in recorder.messages and result.report["up"] is None
 
 
@@ -435,7 +430,7 @@ def test_ctrl_c_leaves_no_file(stage, photos, finds, tmp_path):
 
     finds(COUNT)
     with pytest.raises(KeyboardInterrupt):
-        find_poses(photos, tmp_path / "capture", None, Interrupts())
+        find_poses(photos, tmp_path / "capture", progress=Interrupts())
     assert os.listdir(tmp_path) == ["photos"]
 
 
@@ -462,7 +457,7 @@ def test_frames_of_a_video_are_extracted(finds, tmp_path):
             out.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
         out.mux(stream.encode())
     finds(4)
-    result = find_poses(tmp_path / "film.mp4", tmp_path / "capture", PoseOptions(num_frames=4))
+    result = find_poses(tmp_path / "film.mp4", tmp_path / "capture", num_frames=4)
     seconds = list(result.report["seconds"].values())
     assert result.registered == [f"frame_{round(10 * s) + 1:06d}.jpg" for s in seconds]
     assert len(seconds) == 4 and seconds == sorted(seconds) and seconds[-1] >= 0.8
