@@ -238,7 +238,15 @@ def trained(tmp_path_factory):
     mi.set_variant("llvm_ad_rgb")
     folder = tmp_path_factory.mktemp("trained")
     replace(crowd(1500), persons=("Ada", "Grace", "Mary", "Edsger")).save(folder / "rays.npz")
-    small = {"radius": 0.5, "probes": 8, "steps": 2, "directions": 64, "zones": 0, "min_rays": 8, "voxel": 0.3}
+    small = {
+        "radius": 0.5,
+        "probes": 8,
+        "steps": 2,
+        "directions": 64,
+        "validation_zones": 0,
+        "min_rays": 8,
+        "voxel_size": 0.3,
+    }
     options = GazeOptions(geometry="hits", test_zones=1, test_positions=3, **small)
     train_gaze(folder / "rays.npz", folder / "gaze.safetensors", options)
     return folder

@@ -82,7 +82,7 @@ def test_messages_mention_parameters_and_no_options():
     package = Path(nerg.__file__).parent
     wrong = []
     for path in sorted(package.rglob("*.py")):
-        if path.relative_to(package).parts[0] in ("cli", "scenes") or path.name == "old_names.py":
+        if path.relative_to(package).parts[0] in ("cli", "scenes"):
             continue
         for line, text in list_texts(ast.parse(path.read_text(encoding="utf-8"))):
             # A text without a space before the option is a part of a command.

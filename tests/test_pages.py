@@ -462,7 +462,7 @@ SMALLER = {
     "nerg train": "--radius 0.6 --probes 8 --steps 2 --directions 64 --min-rays 8 --seed 1 --test-positions 4 --force",
     "nerg eval": "--min-rays 4",
     "nerg scene": "--width 36",
-    "nerg report": "--width 36 --spp 1 --points 500",
+    "nerg report": "--width 36 --spp 1 --max-points 500",
     "nerg stats": "--viewpoints 8 --directions 256 --resamples 199",
 }
 """What is added to a command, so that it takes a second."""

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nerg_mi.errors import NergError, parameter, sanitize
-from nerg_mi.old_names import accept_old_keywords
 from nerg_mi.options import (
     ALIGN_HELP,
     ANALYSIS,
@@ -212,10 +211,6 @@ class StatisticsOptions(CountOptions, PredictionOptions, PartOptions):
         super().__post_init__()
         for text in self.observers:
             parse_point(text, parameter("observers"))
-
-
-# The command is declared in nerg_mi.workflows.scene_commands.
-accept_old_keywords(StatisticsOptions, "stats")
 
 
 def parse_window(text: str) -> tuple[str, float, float]:

@@ -35,7 +35,6 @@ from nerg_mi.files.values import to_numbers
 from nerg_mi.formats.areas import format_areas
 from nerg_mi.formats.splats import write_ply_splats
 from nerg_mi.maths.transforms import check_rigid_transforms
-from nerg_mi.old_names import current_keywords
 from nerg_mi.options import GeometryOptions
 from nerg_mi.progress import WarningReporter
 from nerg_mi.rays.rays import Rays
@@ -268,7 +267,7 @@ def build_options(kind: type[Options], function: str, options: Options | None, o
     NergError
         An option or a file does not exist.
     """
-    types, overrides = {f.name: str(f.type) for f in fields(kind)}, current_keywords(kind, overrides)
+    types = {f.name: str(f.type) for f in fields(kind)}
     if "mode" in overrides:
         raise NergError(f"{function} uses the active variant; call mi.set_variant({overrides['mode']!r}) before it")
     if {"field", "scene"} <= types.keys():

@@ -73,10 +73,8 @@ def import_rays(
     from nerg_mi.rays.readers.base import list_options
     from nerg_mi.rays.readers.registry import get_reader, list_reader_names, make_options
     from nerg_mi.workflows import rays
-    from nerg_mi.workflows.rays import current_import_keywords
 
     with report_progress(progress) as reporter:
-        options = current_import_keywords(options)
         file_list = [files] if isinstance(files, (str, os.PathLike)) or not isinstance(files, Sequence) else files
         if not all(isinstance(file, (str, os.PathLike)) for file in file_list):
             raise NergError(

@@ -20,7 +20,6 @@ import typer.core
 
 from nerg_mi import __version__
 from nerg_mi.errors import Spelling, clean_text, parameter, sanitize, spell_command_line
-from nerg_mi.old_names import find_spelling
 from nerg_mi.options import GROUPS as GROUPS_OF_OPTIONS
 from nerg_mi.progress import TerminalReporter
 from nerg_mi.ranges import KAPPAS, RANGE
@@ -244,10 +243,8 @@ def build_command(command: Command, line: str = "") -> Any:
     app.command(command.name.split()[-1], help=help, cls=_GroupedCommand)(make_callback(command))
     parser: Any = typer.main.get_command(app)
     parser.view = command.view
-    spellings = {spelling for p in parser.params for spelling in (*p.opts, *p.secondary_opts)}
     # In the order of the help, also for the reference in the manual.
     parser.params.sort(key=_group_position)
-    parser.context_settings["token_normalize_func"] = find_spelling(command.name, spellings)
     return parser
 
 

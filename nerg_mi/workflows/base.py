@@ -11,7 +11,6 @@ from types import ModuleType
 from typing import Any, TypeVar
 
 from nerg_mi import __version__, llvm
-from nerg_mi.old_names import accept_old_keywords
 from nerg_mi.options import OUTPUT, PANEL
 from nerg_mi.threads import set_thread_count
 
@@ -144,9 +143,6 @@ def command(
     parameters
         Arguments and options. The names are those of fields of ``options`` or of parameters of the function.
     """
-
-    if options is not None:
-        accept_old_keywords(options, name)
 
     def decorate(run: Run) -> Run:
         COMMANDS[name] = Command(name, run, help, more, options, without, further, parameters, view)

@@ -274,7 +274,7 @@ def _camera_of(sensor) -> dict:
     pose = sensor.world_transform()
     at, ahead = (np.ravel(np.array(pose @ mi.Point3f(*p), np.float64)) for p in ((0, 0, 0), (0, 0, 1)))
     fov = float(np.ravel(np.array(mi.traverse(sensor)["x_fov"]))[0])
-    return {"camera_from": tuple(at.tolist()), "camera_to": tuple(ahead.tolist()), "fov": fov}
+    return {"camera": tuple(at.tolist()), "target": tuple(ahead.tolist()), "fov": fov}
 
 
 def observer_pixel(scene) -> tuple[float, float] | None:

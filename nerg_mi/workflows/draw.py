@@ -30,7 +30,6 @@ from nerg_mi.formats.meshes import read_mesh_file
 from nerg_mi.formats.ply import parse_ply
 from nerg_mi.formats.splats import is_splat_file
 from nerg_mi.maths.arrays import to_vector
-from nerg_mi.old_names import current_keywords
 from nerg_mi.progress import SILENT, Reporter
 from nerg_mi.rendering.bands import SURFACE_OPACITY
 from nerg_mi.rendering.scene import activate_variant
@@ -356,7 +355,6 @@ def draw(
     import mitsuba as mi
 
     figure_kind = find_kind(kind)
-    options = current_keywords(figure_kind.options, options)
     types = {f.name: str(f.type) for f in fields(figure_kind.options)}
     if "mode" in types and mi.variant() is not None:
         options.setdefault("mode", mi.variant())

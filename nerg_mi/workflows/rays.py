@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import secrets
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +17,6 @@ from nerg_mi.figures.style import existing_files, make_provenance
 from nerg_mi.files.atomic import check_new_folder, check_writable, create_folder_atomically
 from nerg_mi.files.tables import write_json
 from nerg_mi.files.values import normalize_name
-from nerg_mi.old_names import find_keywords, get_spellings, rename_keywords
 from nerg_mi.progress import SILENT, Reporter
 from nerg_mi.rays import events, filters
 from nerg_mi.rays.dataset import (
@@ -35,7 +34,7 @@ from nerg_mi.rays.guess import Proposal, propose_imports
 from nerg_mi.rays.pseudonyms import make_file_aliases, pseudonymise, read_salt
 from nerg_mi.rays.quality import RaysSummary, format_quality_report, summarise, summarise_dataset
 from nerg_mi.rays.rays import SUFFIXES, Rays, merge_rays
-from nerg_mi.rays.readers.registry import TABLE, collect_shared_options, get_reader, parse_options, read_rays
+from nerg_mi.rays.readers.registry import TABLE, get_reader, parse_options, read_rays
 
 from .rays_commands import DATASET, FilterOptions, PlotOptions, RaysImportOptions, SplitOptions
 
@@ -614,9 +613,3 @@ def _save(rays: Rays, output: FileName | None) -> None:
 def _report_written(output: FileName | None, reporter: Reporter) -> None:
     if output is not None:
         reporter.message(f"wrote {output}")
-
-
-def current_import_keywords(keywords: Mapping[str, Any]) -> dict[str, Any]:
-    """Return ``keywords`` of `import_rays`, those of its command and of all readers, by their current names."""
-    spellings = {option.name: option.flag for option in collect_shared_options()} | get_spellings(RaysImportOptions)
-    return rename_keywords(find_keywords("rays import", spellings), keywords)

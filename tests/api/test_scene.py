@@ -104,7 +104,10 @@ def test04_files_may_be_named_by_strings(rgb):
 
 CALLS = [
     (lambda: nerg.train_gaze("no.npz", scene="no.xml", test_particpants=0.3), 'did you mean "test_participants"'),
-    (lambda: nerg.train_gaze("no.npz", scene="no.xml", test_people=0.3), 'file "no.xml" of "scene" does not exist'),
+    (
+        lambda: nerg.train_gaze("no.npz", scene="no.xml", test_participants=0.3),
+        'file "no.xml" of "scene" does not exist',
+    ),
     (lambda: nerg.train_gaze("no.npz", geometry="none"), 'file "no.npz" of "rays" does not exist'),
     (
         lambda: nerg.train_gaze(np.zeros(3), geometry="none"),

@@ -55,8 +55,8 @@ def test02_rays_in_memory_and_in_a_file_are_one(rgb, tmp_path):
     write_columns(tmp_path / "room.ply", dict(zip("xyz", v.T)), f)
     rays = Rays([0.0, 0.1], [0, 0], ("a",), np.ones((2, 3)), np.array([[1.0, 0, 0], [0, 1, 0]]), np.ones(2))
     rays.save(tmp_path / "a.npz")
-    first = bake(tmp_path / "room.ply", rays=rays, detail=1.0)
-    second = bake(str(tmp_path / "room.ply"), str(tmp_path / "b.json"), rays=str(tmp_path / "a.npz"), detail=1.0)
+    first = bake(tmp_path / "room.ply", rays=rays, max_edge=1.0)
+    second = bake(str(tmp_path / "room.ply"), str(tmp_path / "b.json"), rays=str(tmp_path / "a.npz"), max_edge=1.0)
     assert np.array_equal(first.density, second.density) and second.files == (tmp_path / "b.json",)
     with pytest.raises(NergError, match='"smoth".*"smooth"'):
         bake(tmp_path / "room.ply", rays=rays, smoth=0.1)
@@ -217,7 +217,7 @@ def test04_trained_fields_can_be_rendered(rgb, tmp_path):
     direction = rng.normal(size=(500, 3)) * (1, 1, 0.2)
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     rays = nerg.Rays(np.arange(500.0), np.zeros(500, int), ("Ada",), origin, direction, np.ones(500))
-    field = nerg.train_gaze(rays, tmp_path / "gaze.safetensors", geometry="none", steps=1, zones=0, probes=4)
+    field = nerg.train_gaze(rays, tmp_path / "gaze.safetensors", geometry="none", steps=1, validation_zones=0, probes=4)
     assert field.name == "gaze.safetensors" and field.provenance["steps"] == 1
     again = nerg.load_gaze(tmp_path / "gaze.safetensors")
     walls = {"type": "cube", "to_world": rgb.ScalarTransform4f().scale(4)}

@@ -44,7 +44,7 @@ STATS += "aois.png transitions.png "
 STATS += "about.json"
 if has_parquet():
     STATS += " aois.parquet transitions.parquet durations.parquet participants.parquet"
-GAZE = "--radius 0.6 --probes 8 --steps 2 --directions 64 --zones 0 --min-rays 8 --seed 1"
+GAZE = "--radius 0.6 --probes 8 --steps 2 --directions 64 --validation-zones 0 --min-rays 8 --seed 1"
 
 
 @dataclass(frozen=True)
@@ -115,12 +115,12 @@ CASES = (
     Case("scene", "{i}/rays.npz -o {o}/a.xml -m llvm_ad_rgb", ("a.xml", "a.vol", "a.color.vol")),
     Case(
         "scene",
-        "{i}/rays.npz -o {o}/a.xml -m llvm_ad_rgb --geometry none --person a --times 0,2 --gap 100",
+        "{i}/rays.npz -o {o}/a.xml -m llvm_ad_rgb --geometry none --person a --time-range 0,2 --max-gap 100",
         ("a.xml", "a.frames.csv"),
     ),
     Case(
         "report",
-        "{i}/gaze.safetensors {i}/rays.npz -o {o}/a.html --width 24 --spp 1 --points 200 -m llvm_ad_rgb",
+        "{i}/gaze.safetensors {i}/rays.npz -o {o}/a.html --width 24 --spp 1 --max-points 200 -m llvm_ad_rgb",
         ("a.html",),
         once=("workflows.report._ReportWork.run",),
     ),
@@ -134,11 +134,11 @@ CASES = (
     Case("rays filter", "{i}/rays.npz -o {o}/a.parquet --person a", ("a.parquet",)),
     Case("rays events", "{i}/rays.npz -o {o}/a.csv --quality {o}/b.csv", ("a.csv", "b.csv")),
     Case("rays export", "{i}/rays.npz -o {o}/bids", _below("bids", BIDS), ("bids",), needs_new_folder=True),
-    Case("rays split", "{i}/rays.npz -o {o}/a.npz --people 0.5", ("a-train.npz", "a-test.npz")),
+    Case("rays split", "{i}/rays.npz -o {o}/a.npz --test-participants 0.5", ("a-train.npz", "a-test.npz")),
     Case("rays plot", "{i}/rays.npz -o {o}/a.png", ("a.png",)),
     Case(
         "stats",
-        "{i}/rays.npz -o {o}/numbers --areas {i}/areas.json --resamples 199 -m llvm_ad_rgb --store {i}/store",
+        "{i}/rays.npz -o {o}/numbers --aois {i}/areas.json --resamples 199 -m llvm_ad_rgb --store {i}/store",
         _below("numbers", STATS),
         ("numbers",),
     ),
@@ -174,8 +174,8 @@ CASES = (
     ),
     Case(
         "eval folds",
-        "{i}/rays.npz -o {o}/folds --store {i}/store --geometry none --folds 2 --zones 1 --positions 3 --radius 0.6 "
-        "--probes 8 --steps 2 --directions 128 --min-rays 8 --splits pos --first 1",
+        "{i}/rays.npz -o {o}/folds --store {i}/store --geometry none --folds 2 --test-zones 1 --test-positions 3 "
+        "--radius 0.6 --probes 8 --steps 2 --directions 128 --min-rays 8 --splits pos --seed 1",
         _below("folds", "folds.md folds.csv positions.csv folds.json"),
         ("folds",),
     ),
@@ -195,11 +195,13 @@ CASES = (
     ),
     Case(
         "bake",
-        "{i}/room.ply --rays {i}/rays.npz --detail 2 -m llvm_ad_rgb -o {o}/a.ply -o {o}/a.csv -o {o}/a.json",
+        "{i}/room.ply --rays {i}/rays.npz --max-edge 2 -m llvm_ad_rgb -o {o}/a.ply -o {o}/a.csv -o {o}/a.json",
         ("a.ply", "a.csv", "a.json"),
     ),
     Case(
-        "bake", "{i}/room.ply --rays {i}/rays.npz --detail 2 -m llvm_ad_rgb --store {i}/store -o {o}/a.glb", ("a.glb",)
+        "bake",
+        "{i}/room.ply --rays {i}/rays.npz --max-edge 2 -m llvm_ad_rgb --store {i}/store -o {o}/a.glb",
+        ("a.glb",),
     ),
     Case(
         "bake", "{i}/splats.ply --gaze {i}/gaze.safetensors --observer 0,0,-3 -m llvm_ad_rgb -o {o}/a.ply", ("a.ply",)
@@ -207,10 +209,10 @@ CASES = (
     Case("import", "{i}/nerg.pth -o {o}/a.safetensors -g {o}/g.safetensors", ("a.safetensors", "g.safetensors")),
     Case("refine", "{i}/full.safetensors -o {o}/a.safetensors", ("a.safetensors",)),
     Case("compile", "{i}/full.safetensors -o {o}/a.safetensors --resolution 16", ("a.safetensors",)),
-    Case("export mesh", "{i}/field.safetensors -o {o}/a.ply --resolution 8 --density 3", ("a.ply",)),
-    Case("export mesh", "{i}/field.safetensors -o {o}/a.glb --resolution 8 --density 3", ("a.glb",)),
-    Case("export points", "{i}/field.safetensors -o {o}/a.ply --resolution 8 --density 3", ("a.ply",)),
-    Case("export splats", "{i}/field.safetensors -o {o}/a.ply --resolution 8 --density 3", ("a.ply",)),
+    Case("export mesh", "{i}/field.safetensors -o {o}/a.ply --resolution 8 --density-threshold 3", ("a.ply",)),
+    Case("export mesh", "{i}/field.safetensors -o {o}/a.glb --resolution 8 --density-threshold 3", ("a.glb",)),
+    Case("export points", "{i}/field.safetensors -o {o}/a.ply --resolution 8 --density-threshold 3", ("a.ply",)),
+    Case("export splats", "{i}/field.safetensors -o {o}/a.ply --resolution 8 --density-threshold 3", ("a.ply",)),
     Case("export volume", "{i}/field.safetensors -o {o}/a.vol --color {o}/c.vol --resolution 8", ("a.vol", "c.vol")),
     Case("export scene", "{i}/room.ply {i}/rays.npz -o {o}/a.usdc", ("a.usdc",)),
     Case("export scene", "{i}/room.ply {i}/rays.npz -o {o}/a.rrd", ("a.rrd",)),
@@ -309,7 +311,7 @@ def make_inputs(folder: Path) -> Path:
 def list_trainings(folder: Path) -> list[list[str]]:
     """Command lines that train the gaze fields of `CASES` on the inputs in ``folder``, without and with held-out
     participants."""
-    line = f"train gaze {folder}/rays.npz --geometry hits --radius 0.5 --probes 8 --steps 2 --directions 64 --zones 0"
-    line += " --min-rays 8 --test-zones 1 --test-positions 3"
+    line = f"train gaze {folder}/rays.npz --geometry hits --radius 0.5 --probes 8 --steps 2 --directions 64"
+    line += " --validation-zones 0 --min-rays 8 --test-zones 1 --test-positions 3"
     more = f"-o {folder}/gaze.safetensors", f"--test-participants 0.5 -o {folder}/participants.safetensors"
     return [[*line.split(), *words.split()] for words in more]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ast
 import math
+import re
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -16,7 +18,7 @@ from typer.testing import CliRunner
 import nerg_mi.cli
 import nerg_mi.workflows
 from nerg_mi.cli import building
-from nerg_mi.cli.building import GROUPS, find_commands, make_callback
+from nerg_mi.cli.building import DEBUG, GROUPS, find_commands, make_callback
 from nerg_mi.cli.table import ROWS, Row
 from nerg_mi.errors import NergError
 from nerg_mi.files.values import FilePath
@@ -26,6 +28,7 @@ from nerg_mi.ranges import KAPPAS, Range, ValidatedDataclass, check_ranges, sett
 from nerg_mi.rays.readers.base import list_options
 from nerg_mi.rays.readers.registry import collect_shared_options, get_reader, list_preset_names
 from nerg_mi.workflows.base import COMMANDS, Command, argument, extra
+from tools.command_pages import iter_commands
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -302,3 +305,23 @@ def test_help_of_an_import_shows_the_options_of_its_preset():
 def test_help_of_an_unknown_preset_names_the_presets():
     done = CliRunner().invoke(nerg_mi.cli.build_app(), ["rays", "import", "--preset", "nothing", "--help"])
     assert "varjo" in str(done.exception)
+
+
+# Options of colmap, pip, Python's server and torch-ngp, and the prefix of negated flags.
+FOREIGN = set("--output_type --force-reinstall --bind --directory --tcnn --ff --color_space --bg_radius --no-".split())
+
+
+def test_texts_name_existing_options():
+    existing = {"--help", "--version", *DEBUG, *FOREIGN}
+    for _, command, _ in iter_commands():
+        existing.update(*((*p.opts, *p.secondary_opts) for p in command.params))
+    package = Path(nerg_mi.cli.__file__).parent.parent
+    unknown = []
+    for path in sorted(package.rglob("*.py")):
+        if path.relative_to(package).parts[0] == "scenes":  # scripts with own options
+            continue
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                named = re.findall(r"(?<![\w-])--[a-z][\w-]*", node.value)
+                unknown += [f"{path.relative_to(package)}: {name}" for name in named if name not in existing]
+    assert not unknown

@@ -305,7 +305,7 @@ def interrupted(name: str, calls: int, *arguments, sent: str = "SIGINT") -> subp
 
 
 ENDLESS = "--steps 1000000 --save-every 0"
-GAZE = "--geometry none --radius 0.6 --probes 8 --directions 64 --zones 0 --min-rays 8"
+GAZE = "--geometry none --radius 0.6 --probes 8 --directions 64 --validation-zones 0 --min-rays 8"
 
 
 # A radiance training makes and discards these steps before its first one.
@@ -382,8 +382,9 @@ def test_an_interrupted_command_exits_immediately(name, inputs, tmp_path):
 
 
 KILLED = {
-    "bake": "bake {i}/room.ply --rays {i}/rays.npz --detail 2 -m llvm_ad_rgb -o {o}/a.ply -o {o}/a.csv -o {o}/a.json",
-    "report": "report {i}/gaze.safetensors {i}/rays.npz -o {o}/a.html --width 24 --spp 1 --points 200 -m llvm_ad_rgb",
+    "bake": "bake {i}/room.ply --rays {i}/rays.npz --max-edge 2 -m llvm_ad_rgb -o {o}/a.ply -o {o}/a.csv -o {o}/a.json",
+    "report": "report {i}/gaze.safetensors {i}/rays.npz -o {o}/a.html --width 24 --spp 1 -m llvm_ad_rgb "
+    "--max-points 200",
 }
 """Command lines. Each output is synchronised by `os.fsync`, and then moved to its place by `os.replace`."""
 

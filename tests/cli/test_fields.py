@@ -119,8 +119,8 @@ def test_a_field_starts_from_features_and_weights(tmp_path, nerg):
     taken = load_radiance(tmp_path / "field.safetensors", ns)[0]
     looking_at((0.5, 0.1, 0.2), 300).save(tmp_path / "rays.npz")
     line = "train gaze {o}/rays.npz -o {o}/gaze.safetensors --field {o}/field.safetensors --recipe small --steps 4 "
-    line += "--semantic snapshot --probes 6 --radius 0.5 --min-rays 8 --directions 32 --zones 0 --begin field --freeze"
-    ended = nerg(*line.format(o=tmp_path).split())
+    line += "--semantic snapshot --probes 6 --radius 0.5 --min-rays 8 --directions 32 --validation-zones 0"
+    ended = nerg(*line.format(o=tmp_path).split(), "--init", "field", "--freeze")
     assert ended.code == 0, ended.err
     trained, metadata = load_gaze(tmp_path / "gaze.safetensors", ns)
     assert trained.config.semantic == "snapshot" and metadata["provenance"]["begins_as"] == "field.safetensors"
@@ -144,7 +144,7 @@ def test_a_field_is_trained_from_salience_images(recipe, tmp_path, nerg, rgb):
     scene, out = tmp_path / "wall.xml", tmp_path / "out.safetensors"
     scene.write_text('<scene version="3.0.0"><shape type="cube"/></scene>')
     place = ["--geometry", "none"] if recipe == "default" else ["--scene", scene]
-    quick = "--steps 2 --directions 64 --zones 0".split()
+    quick = "--steps 2 --directions 64 --validation-zones 0".split()
     images = ["--views", tmp_path, "--salience", tmp_path / "maps"]
     ended = nerg("train", "gaze", *images, "--recipe", recipe, *place, *quick, "-o", out)
     assert ended.code == 0, ended.err
@@ -160,12 +160,12 @@ def test_a_field_is_trained_from_salience_images(recipe, tmp_path, nerg, rgb):
 def test_a_field_is_scored_as_it_was_trained(tmp_path, nerg):
     crowd().save(tmp_path / "rays.npz")
     gaze = tmp_path / "gaze.safetensors"
-    line = "--geometry hits --voxel 0.2 --radius 0.6 --steps 5 --directions 64 --probes 20 --zones 0"
+    line = "--geometry hits --voxel-size 0.2 --radius 0.6 --steps 5 --directions 64 --probes 20 --validation-zones 0"
     train = ["train", "gaze", tmp_path / "rays.npz", "-o", gaze, *line.split()]
     assert nerg(*train).code == 0
     ended = nerg("eval", "gaze", gaze, tmp_path / "rays.npz")
     assert ended.code == 1 and "--test-zones 3" in ended.err
-    assert nerg(*train, "--test-zones", "2", "--test-positions", "6", "--test-people", "0.5").code == 0
+    assert nerg(*train, "--test-zones", "2", "--test-positions", "6", "--test-participants", "0.5").code == 0
     line = "--min-rays 16 --resamples 4 --directions 256 --pictures 1"
     assert nerg("eval", "gaze", gaze, tmp_path / "rays.npz", *line.split()).code == 0
     scores = json.loads((tmp_path / "gaze.eval" / "gaze.json").read_text())
@@ -208,13 +208,13 @@ def test_a_field_is_exported_in_each_format(tmp_path, nerg):
         assert ended.code == 0, ended.err
         return ended.out
 
-    assert "50 points" in export("points", "p.ply", "--resolution", 16, "--density", 3, "--count", 50)
+    assert "50 points" in export("points", "p.ply", "--resolution", 16, "--density-threshold", 3, "--max-points", 50)
     assert len(trimesh.load(tmp_path / "p.ply").vertices) == 50
     said = export("volume", "d.vol", "--color", tmp_path / "c.vol", "--resolution", 8)
     assert "8 x 8 x 8 voxels from (-1, -1, -1) to (1, 1, 1)" in said
     assert (tmp_path / "c.vol").stat().st_size == 48 + 8**3 * 3 * 4 == 3 * (tmp_path / "d.vol").stat().st_size - 2 * 48
     pytest.importorskip("skimage")
-    assert "around holes" in export("mesh", "m.glb", "--resolution", 16, "--density", 3)
+    assert "around holes" in export("mesh", "m.glb", "--resolution", 16, "--density-threshold", 3)
     assert len(trimesh.load(tmp_path / "m.glb", force="mesh").faces) > 100
 
 

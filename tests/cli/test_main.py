@@ -73,7 +73,7 @@ def test05_mode_is_the_variant_of_commands_that_compute():
         options = {option: p for p in command.params for option in p.opts}
         having |= {name} if "--mode" in options else set()
         assert ("-m" in options) == ("--mode" in options)
-        # These commands select the factors of a gaze field; in others it is a hidden old name of --mode.
+        # These commands select the factors of a gaze field.
         assert ("--variant" in options) == (name in ("train gaze", "eval folds")), name
     assert having >= {"align", "bake", "demo", "refine", "render", "report", "scene", "stats", "study", "view"}
     assert all(any(name.startswith(f"{group} ") for name in having) for group in ("train", "eval", "export", "draw"))

@@ -63,7 +63,7 @@ def small(tmp_path_factory):
 
 
 GAZE = "train gaze rays.npz -o {o}/a.safetensors --geometry none --steps 1"
-VIEWS = "train gaze -o {o}/a.safetensors --steps 2 --directions 64 --zones 0"
+VIEWS = "train gaze -o {o}/a.safetensors --steps 2 --directions 64 --validation-zones 0"
 PHOTOS = f"{VIEWS} --geometry none --views photos"
 LINES = {
     # Options that contradict each other, or have invalid values.
@@ -73,7 +73,7 @@ LINES = {
     f"{GAZE} --ensemble 1": "at least two members",
     f"{PHOTOS} --salience no": 'the folder "no" of salience images does not exist',
     f"{PHOTOS} --salience photos": "has colours",
-    f"{PHOTOS} --salience maps --salience-per degree": "per must be pixel or steradian",
+    f"{PHOTOS} --salience maps --salience-unit degree": "per must be pixel or steradian",
     "train radiance empty -o {o}/a.safetensors --resume": "no state to resume",
     "train radiance empty -o {o}/a.safetensors --steps 5 --minutes 1": "exactly one|either in steps or in minutes",
     "eval radiance no.safetensors photos -o {o}/a": "does not exist",
@@ -102,11 +102,11 @@ LINES = {
     "jobs empty": "contains no parts of jobs",
     "worker somewhere": "is not a scheduler address",
     "export mesh f.safetensors -o {o}/a.obj": r"ends in \.ply or \.glb",
-    "export points f.safetensors -o {o}/a.ply --resolution 8 --density 1e9": "does not cross",
+    "export points f.safetensors -o {o}/a.ply --resolution 8 --density-threshold 1e9": "does not cross",
     "export points f.safetensors -o {o}/a.glb --up x": "--up must be z or y",
     "export splats f.safetensors -o {o}/a.splat": r"ends in \.ply",
     "export volume f.safetensors -o {o}/a.exr": r"ends in \.vol",
-    "export points f.safetensors -o {o}/a.ply --variant no": r"no Mitsuba variant \"no\"",
+    "export points f.safetensors -o {o}/a.ply --mode no": r"no Mitsuba variant \"no\"",
     "export torch-ngp f.safetensors -o {o}/a.pth": "torch-ngp cannot represent this field",
     "import ngp.pth": "no output is given",
     "import ngp.pth -g {o}/g.safetensors": "contains no gaze field",
@@ -116,7 +116,7 @@ LINES = {
     "poses photos/0.png -o {o}/a": "is a single photo",
     "poses photos/nowhere -o {o}/a": "there is no video",
     "poses empty -o {o}/a": "contains no photos",
-    "poses photos -o {o}/a --lens fish": "lens must be auto, radial, opencv",
+    "poses photos -o {o}/a --camera-model fish": "lens must be auto, radial, opencv",
     "poses photos -o photos": "not empty: choose another name, or remove it",
     "poses photos -o rays.npz": "is a file",
 }
@@ -184,9 +184,9 @@ PIPES = [
     f"align {RAYS} --surface {{p}}.csv -o {{o}}/a.json",
     "align --pairs {p}.csv -o {o}/a.json",
     f"align {RAYS} --scene {{p}}.xml -o {{o}}/a.json",
-    f"stats {RAYS} -o {{o}}/s --areas {{p}}.json",
-    f"stats {RAYS} {{p}}.vol -o {{o}}/s --areas {{i}}/areas.json",
-    f"stats {RAYS} -o {{o}}/s --areas {{i}}/areas.json --cohorts {{p}}.csv",
+    f"stats {RAYS} -o {{o}}/s --aois {{p}}.json",
+    f"stats {RAYS} {{p}}.vol -o {{o}}/s --aois {{i}}/areas.json",
+    f"stats {RAYS} -o {{o}}/s --aois {{i}}/areas.json --cohorts {{p}}.csv",
     "report {p}.safetensors -o {o}/a.html",
     "import {p}.pth -o {o}/a.safetensors",
     "export mesh {p}.safetensors -o {o}/a.ply",

@@ -187,7 +187,7 @@ def defines(files):
 
 def test_the_demo_writes_and_names_everything(rgb, standins, tmp_path, nerg):
     out = tmp_path / "new" / "demo"
-    ended = nerg("demo", "--out", out, *TINY, *defines(standins))
+    ended = nerg("demo", "--output", out, *TINY, *defines(standins))
     assert ended.code == 0 and {p.name for p in out.iterdir()} == NAMES
     assert all(str(out / n) in ended.out for n in NAMES) and "Open it with: " in ended.out
 
@@ -229,7 +229,7 @@ def test_equal_seeds_give_equal_demo_files(rgb, standins, tmp_path):
 @pytest.mark.parametrize("name", ["field", "gaze"])
 def test_a_missing_checkpoint_names_the_command(standins, tmp_path, nerg, name):
     files = {**standins, name: str(tmp_path / "nowhere.safetensors")}
-    ended = nerg("demo", "--out", tmp_path / "out", *TINY, *defines(files))
+    ended = nerg("demo", "--output", tmp_path / "out", *TINY, *defines(files))
     assert ended.code == 1 and f"the {name} checkpoint" in ended.err and "python -m nerg_mi.scenes.store" in ended.err
     assert not (tmp_path / "out").exists()
 
@@ -270,7 +270,7 @@ def test_the_demo_evaluation_matches_its_field(standins):
 
 
 def test_ctrl_c_ends_the_demo_and_leaves_no_file(standins, tmp_path):
-    large = ["demo", "--out", tmp_path / "out", "--width", 2000, "--spp", 1000, *LLVM, *defines(standins)]
+    large = ["demo", "--output", tmp_path / "out", "--width", 2000, "--spp", 1000, *LLVM, *defines(standins)]
     said, code = interrupt(large, b"camera")
     assert code == 130 and b"Interrupted." in said
     assert not (tmp_path / "out").exists()
@@ -310,7 +310,7 @@ def test_a_figure_accepts_scene_parameters(nerg, tmp_path):
 def test_a_mesh_becomes_a_picture(nerg, tmp_path):
     (tmp_path / "a.obj").write_text("v -1 -1 0\nv 1 -1 0\nv 0 1 0\nf 1 2 3\n")
     path = tmp_path / "new" / "scene.xml"
-    ended = nerg("scene", tmp_path / "a.obj", "-o", path, "--from=0,-3,2", "--to=0,0,0", "--width", 24, *LLVM)
+    ended = nerg("scene", tmp_path / "a.obj", "-o", path, "--camera=0,-3,2", "--target=0,0,0", "--width", 24, *LLVM)
     assert ended.code == 0 and f"wrote {path}" in " ".join(ended.out.split())
     assert nerg("render", path, "-o", tmp_path / "a.png", *LLVM, "--spp", 4).code == 0
     picture = np.array(mitsuba_bitmap(tmp_path / "a.png"))
@@ -319,15 +319,15 @@ def test_a_mesh_becomes_a_picture(nerg, tmp_path):
 
 def test_options_reach_the_viewer_and_the_report(handed, nerg):
     calls = handed("view")
-    line = "view a.xml b.npz --port 0 --observer=1,2,3 --host ::1 --name lab --width 320"
+    line = "view a.xml b.npz --port 0 --observer=1,2,3 --host ::1 --hostname lab --width 320"
     assert nerg(*line.split()).code == 0
     ((files, options),) = ((call["files"], call["options"]) for call in calls)
     assert [f.name for f in files] == ["a.xml", "b.npz"] and options.observer == (1, 2, 3)
     assert (options.host, options.port, options.hostnames, options.width) == ("::1", 0, ("lab",), 320)
 
     calls = handed("report")
-    line = "report gaze.safetensors day.npz -o a.html --objects o.json --names --min-persons 3 --no-paths --from 1,2,3"
-    assert nerg(*line.split(), "--to", "0,0,1", "--evaluate", "--title", "Mine").code == 0
+    line = "report gaze.safetensors day.npz -o a.html --aois o.json --show-names --min-participants 3 --no-paths"
+    assert nerg(*line.split(), "--camera", "1,2,3", "--target", "0,0,1", "--evaluate", "--title", "Mine").code == 0
     ((files, output, options),) = ((call["files"], call["output"], call["options"]) for call in calls)
     assert files == [Path("gaze.safetensors"), Path("day.npz")] and output == Path("a.html")
     assert options.aois == Path("o.json") and options.show_names and options.min_participants == 3 and not options.paths
@@ -352,8 +352,8 @@ def test_rays_on_a_room_without_a_wall(nerg, tmp_path):
     write_columns(tmp_path / "room.ply", dict(zip("xyz", v.T)), f)
     d = np.array([(1.0, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0)])
     Rays(np.arange(4) / 10, np.zeros(4), ("a",), np.ones((4, 3)), d, np.ones(4)).save(tmp_path / "a.npz")
-    line = f"bake {tmp_path}/room.ply --rays {tmp_path}/a.npz --cone 0 --detail 1 -o {tmp_path}/a.json -m llvm_ad_rgb"
-    ended = nerg(*line.split(), "--weights", "equal")
+    line = f"bake {tmp_path}/room.ply --rays {tmp_path}/a.npz --cone 0 --max-edge 1 -o {tmp_path}/a.json -m llvm_ad_rgb"
+    ended = nerg(*line.split(), "--ray-weights", "equal")
     assert not ended.code and "gaze of 4 rays: 75.00% on the surface" in ended.out
     assert "25.00% hits no surface" in ended.out
     assert json.loads((tmp_path / "a.json").read_text())["escaped"] == pytest.approx(0.25)
@@ -362,7 +362,7 @@ def test_rays_on_a_room_without_a_wall(nerg, tmp_path):
 def test_stats_writes_attention_tables(nerg, tmp_path):
     write_place(tmp_path, gaze=False)
     people().save(tmp_path / "rays.npz")
-    line = "stats {o}/rays.npz {o}/scene.xml --areas {o}/areas.json -o {o}/out --window early=0,8 --resamples 199"
+    line = "stats {o}/rays.npz {o}/scene.xml --aois {o}/areas.json -o {o}/out --window early=0,8 --resamples 199"
     ended = nerg(*line.format(o=tmp_path).split(), *LLVM)
     assert ended.code == 0 and "480 rays of 6 participants" in ended.out + ended.err
     assert "| window early | the sign | measured | 6 |" in (tmp_path / "out" / "aois.md").read_text()
@@ -371,7 +371,7 @@ def test_stats_writes_attention_tables(nerg, tmp_path):
 @pytest.mark.nightly
 def test_a_quick_study_runs(tmp_path, nerg):
     out = tmp_path / "new"
-    ended = nerg(*"study slab --quick --width 24 --height 16 -m llvm_ad_rgb --out".split(), out)
+    ended = nerg(*"study slab --quick --width 24 --height 16 -m llvm_ad_rgb --output".split(), out)
     assert not ended.code
     for name in ("study.csv", "study.md", "scaling.csv", "study.json", "errors.png", "scaling.png"):
         assert (out / name).is_file() and str(out / name) in ended.out.replace("\n", "")

@@ -230,7 +230,7 @@ def test03_the_integrator_agrees_with_the_reference(rgb, scene, falloff, visibil
 def test05_shapes_without_triangles_are_refused(tmp_path, scene, capsys):
     scene.write_text(SCENE.format(falloff=0.0, more='<shape type="sphere"/>'))
     with pytest.raises(SystemExit):
-        main(["study", str(scene), "--out", str(tmp_path / "out"), "--quick", "-m", "llvm_ad_rgb"])
+        main(["study", str(scene), "--output", str(tmp_path / "out"), "--quick", "-m", "llvm_ad_rgb"])
     assert "a study of shapes supports only meshes, and this scene has a Sphere" in " ".join(
         capsys.readouterr().err.split()
     )

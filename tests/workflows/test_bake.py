@@ -121,7 +121,7 @@ def test03_scene_units_are_converted_to_metres(rgb, tmp_path):
     v, f = box((0, 0, 0), (8, 6, 3))
     for name, scale in (("a", 1), ("b", 2)):
         write_columns(tmp_path / f"{name}.ply", dict(zip("xyz", scale * v.T)), f)
-    options = {"cone": 1.5, "detail": 0.9, "smooth": 0.3, "mode": "llvm_ad_rgb"}
+    options = {"cone": 1.5, "max_edge": 0.9, "smooth": 0.3, "mode": "llvm_ad_rgb"}
     first = bake(tmp_path / "a.ply", (), BakeOptions(**options), rays=rays())
     second = bake(tmp_path / "b.ply", (), BakeOptions(**options, align=tmp_path / "align.json"), rays=rays())
     assert np.allclose(first.density, second.density, rtol=1e-4, atol=1e-6)
@@ -147,10 +147,10 @@ def test07_a_mesh_in_millimetres_causes_a_warning(rgb, tmp_path):
     write_columns(tmp_path / "mm.ply", dict(zip("xyz", v.T)), f)
     (tmp_path / "align.json").write_text("[[1e3,0,0,0],[0,1e3,0,0],[0,0,1e3,0],[0,0,0,1]]")
     recorder, aligned_recorder = Recorder(), Recorder()
-    options = {"detail": 5e3, "cone": 0.0, "mode": "llvm_ad_rgb"}
+    options = {"max_edge": 5e3, "cone": 0.0, "mode": "llvm_ad_rgb"}
     bake(tmp_path / "mm.ply", (), BakeOptions(**options), recorder, rays=rays(4))
     assert any("10,440 m across" in said and "align" in said for said in recorder.warnings)
-    options["detail"] = 5.0
+    options["max_edge"] = 5.0
     bake(tmp_path / "mm.ply", (), BakeOptions(**options, align=tmp_path / "align.json"), aligned_recorder, rays=rays(4))
     assert not aligned_recorder.warnings
 
@@ -180,7 +180,7 @@ def test01_the_source_of_gaze_is_selected(options, with_gaze, source):
         ({}, "there is no gaze: give a gaze field with"),
         ({"source": "eyes"}, "source must be field or rays, got"),
         ({"rays": RAYS_FILE, "unit": "hours"}, "unit"),
-        ({"gaze": GAZE_FILE, "halves": True}, "unit=.seconds. and split_half=True apply to rays,"),
+        ({"gaze": GAZE_FILE, "split_half": True}, "unit=.seconds. and split_half=True apply to rays,"),
         ({"rays": RAYS_FILE, "observer": (0.0, 0.0, 0.0)}, "observer and observer_file need a gaze"),
     ],
 )
@@ -418,7 +418,7 @@ def test_baked_files_are_byte_identical_in_parts(tmp_path):
     d = directed(n).directions
     rays = Rays(np.arange(n) / 10, np.arange(n) % 2, ("a", "b"), np.full((n, 3), 1.5), d, np.ones(n))
     rays.save(tmp_path / "rays.npz")
-    common = {"rays": tmp_path / "rays.npz", "detail": 2.0, "halves": True, "mode": "llvm_ad_rgb"}
+    common = {"rays": tmp_path / "rays.npz", "max_edge": 2.0, "split_half": True, "mode": "llvm_ad_rgb"}
     for folder, extra in (("one", {}), ("parts", {"store": tmp_path / "store"})):
         outputs = [tmp_path / folder / f"a{suffix}" for suffix in (".ply", ".glb", ".csv", ".json")]
         bake(tmp_path / "room.ply", outputs, BakeOptions(**common, **extra))
@@ -661,14 +661,16 @@ def test02_observer_paths_and_other_units(rgb, place):
     (place / "walk.csv").write_text("x,y,z,weight\n0,0,-3,1\n0,0,-3,3\n0,3,0,0\n")
     (place / "align.json").write_text("[[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]]")
     one = bake_place(place)
-    many = bake_place(place, observer=None, path=place / "walk.csv", align=place / "align.json", top=0.5, decades=2.0)
+    many = bake_place(
+        place, observer=None, observer_file=place / "walk.csv", align=place / "align.json", vmax=0.5, log_decades=2.0
+    )
     assert many.observers == 3 and np.allclose(many.attention, 4 * one.attention, rtol=1e-5)
 
 
 @pytest.mark.parametrize(
     "options, said",
     [
-        ({"texture": 512}, "texture"),
+        ({"texture_size": 512}, "texture"),
         ({"shapes": ("a",)}, "shapes does not apply to Gaussian splats;"),
         ({"source": "field", "gaze": None}, "--field SPLATS"),
     ],
@@ -695,7 +697,13 @@ def test04_rays_give_equal_files_with_and_without_parts(rgb, tmp_path, monkeypat
     monkeypatch.setattr(bake_chunks, "RAYS", 200)
     write_ply_splats(tmp_path / "wall.ply", wall(0.0, 1.0, 0.03, 0.0005))
     make_wall_rays().save(tmp_path / "rays.npz")
-    common = {"rays": tmp_path / "rays.npz", "mode": "llvm_ad_rgb", "bundle": 4, "halves": True, "smooth": 0.05}
+    common = {
+        "rays": tmp_path / "rays.npz",
+        "mode": "llvm_ad_rgb",
+        "cone_samples": 4,
+        "split_half": True,
+        "smooth": 0.05,
+    }
     for folder, extra in (("one", {}), ("parts", {"store": tmp_path / "store"})):
         recorder = Recorder()
         outputs = [tmp_path / folder / f"a{suffix}" for suffix in (".ply", ".json")]
@@ -718,7 +726,7 @@ def test04_rays_give_equal_files_with_and_without_parts(rgb, tmp_path, monkeypat
 
 def test05_a_smoothed_field_in_parts(rgb, place):
     (place / "walk.csv").write_text("x,y,z\n0,0,-3\n0,1,-3\n1,0,-3\n")
-    common = {"observer": None, "path": place / "walk.csv"}
+    common = {"observer": None, "observer_file": place / "walk.csv"}
     one, parts = (bake_place(place, "one.ply", **common), bake_place(place, "two.ply", store=place / "store", **common))
     assert np.array_equal(one.attention, parts.attention)
     # Separate balls have no neighbours to share attention with.

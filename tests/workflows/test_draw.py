@@ -85,7 +85,7 @@ def test_the_second_image_is_subtracted_from_the_first(tmp_path):
     other = GAZE[::-1].copy()
     a = write(tmp_path / "a.exr", **{"opacity.Y": OPACITY})
     b = write(tmp_path / "b.exr", **{"opacity.Y": OPACITY, "gaze.Y": other})
-    figure = draw("difference", [a, b], top=0.5)
+    figure = draw("difference", [a, b], vmax=0.5)
     shown = figure.axes[0].images[0].get_array()
     mask = OPACITY > 0.5
     wanted = apply_colormap("RdBu_r", np.clip(0.5 + (GAZE - other), 0, 1), kind="diverging")
@@ -100,7 +100,7 @@ def test_differences_that_cannot_be_drawn_are_refused(tmp_path):
         ([a], {}, "a difference needs two images, got"),
         ([a, tmp_path / "b.exr"], {}, "8 x 6 and 4 x 3 pixels cannot be compared"),
         ([a, a], {"cmap": "viridis"}, "not a diverging colour map"),
-        ([a, a], {"top": -1.0}, "vmax must lie in"),
+        ([a, a], {"vmax": -1.0}, "vmax must lie in"),
         ([a, a, a], {}, "takes 1 to 2 files, got 3"),
     ):
         with pytest.raises(NergError, match=said):
@@ -140,7 +140,7 @@ def test_a_sheet_without_values_needs_a_scale(tmp_path):
     dark = write(tmp_path / "a.exr", **{"gaze.Y": 0 * GAZE})
     with pytest.raises(NergError, match='"gaze" is 0'):
         draw("sheet", dark, overlay="gaze")
-    assert draw("sheet", dark, overlay="gaze", top=1.0).axes
+    assert draw("sheet", dark, overlay="gaze", vmax=1.0).axes
 
 
 def test_the_basis_of_the_gaze_is_printed_below_the_images(tmp_path):
@@ -178,7 +178,7 @@ def bar(figure):
 def test_values_are_drawn_at_their_positions(tmp_path):
     """From 2 above, a view of 90 degrees is 4 wide: the square fills the middle half, brighter to the right."""
     path = write_surface(tmp_path / "a.ply", [0, 4, 4, 0])
-    figure = draw("surface", path, mode="llvm_ad_rgb", width=80, height=80, top=4.0, **ABOVE)
+    figure = draw("surface", path, mode="llvm_ad_rgb", width=80, height=80, vmax=4.0, **ABOVE)
     shown = picture(figure)
     paper = shown[2, 2]
     assert np.allclose(shown[:19], paper) and np.allclose(shown[:, :19], paper) and np.allclose(shown[61:], paper)
@@ -194,10 +194,10 @@ def test_values_are_drawn_at_their_positions(tmp_path):
 def test_geometry_above_the_cut_is_hidden_and_the_default_view_shows_everything(tmp_path):
     lid = SQUARE + [0, 0, 1]
     path = write_surface(tmp_path / "a.ply", [1] * 4 + [9] * 4, np.concatenate([SQUARE, lid]))
-    size = {"width": 60, "height": 60, "top": 9.0, "mode": "llvm_ad_rgb"}
+    size = {"width": 60, "height": 60, "vmax": 9.0, "mode": "llvm_ad_rgb"}
     level = {"up": (0.0, 0.0, 1.0)}
     closed, opened = (
-        picture(draw("surface", path, **size, **(ABOVE | changes))) for changes in (level, level | {"below": 0.5})
+        picture(draw("surface", path, **size, **(ABOVE | changes))) for changes in (level, level | {"clip_above": 0.5})
     )
     assert closed[30, 30].sum() > opened[30, 30].sum() + 0.3
     seen = picture(draw("surface", path, **size))
@@ -231,7 +231,7 @@ def test_surfaces_that_cannot_be_drawn_are_refused(tmp_path):
         (tmp_path / "bare.ply", {}, "give a .ply file that"),
         (tmp_path / "odd.ply", {}, "odd.ply"),
         (damaged, {}, "is damaged"),
-        (good, {"below": -1.0}, "clip_above"),
+        (good, {"clip_above": -1.0}, "clip_above"),
         (good, {"camera": (0.0, 0, 2), "target": (0.0, 0, 5)}, "is in the image"),
         (good, {"camera": (0.0, 0, 2), "target": (0.0, 0, 2)}, "from camera to target must not be"),
         (good, {"up": (0.0, 0, 0)}, "up must not be of length 0"),
@@ -252,8 +252,8 @@ def test_splats_are_drawn_with_their_gaze(tmp_path):
 def test_wrong_scale_options_are_refused():
     assert ScaleOptions(cmap="viridis", log_decades=3, hatching=False).style("a") == Style("viridis", 3, False, "a")
     for options, said in (
-        ({"top": 0.0}, "vmax must lie in"),
-        ({"decades": -1}, "log_decades"),
+        ({"vmax": 0.0}, "vmax must lie in"),
+        ({"log_decades": -1}, "log_decades"),
         ({"cmap": "jet"}, '"jet" is no'),
     ):
         with pytest.raises(NergError, match=said):
@@ -325,7 +325,7 @@ def test_the_sphere_shows_the_gaze_of_the_observer(rgb, scene_sphere):
     """Compared with rays of the API from the observer's eye, in directions of the panorama that the test rotates."""
     import nerg_mi as nerg
 
-    figure = draw("sphere", scene_sphere, width=64, spp=1, mode=MODE, projection="equirectangular", top=0.5)
+    figure = draw("sphere", scene_sphere, width=64, spp=1, mode=MODE, projection="equirectangular", vmax=0.5)
     assert "integral" in figure.axes[0].get_title().replace("\n", " ")
     assert figure.axes[-1].get_ylabel().replace("\n", " ") == "gaze density [1/sr]"
     shown = figure.axes[0].images[0].get_array()
@@ -392,7 +392,7 @@ def test_a_triptych_has_one_scale(rgb, scene_triptych, monkeypatch):
 def test_figures_of_extrapolated_observers_say_so_once(rgb, scene_triptych, kind):
     for eye, count in (("0.2, 0.1, 0.9", 0), ("0.2, 0.1, 2.5", 1)):
         recorder = Recorder()
-        draw(kind, scene_triptych, reporter=recorder, mode=MODE, spp=1, defaults={"eye": eye}, top=0.5)
+        draw(kind, scene_triptych, reporter=recorder, mode=MODE, spp=1, defaults={"eye": eye}, vmax=0.5)
         assert sum("extrapolated" in text for text in recorder.warnings) == count
 
 
@@ -504,7 +504,7 @@ def test_paths_break_at_recording_gaps(rays):
 
 
 def test_one_participant_and_their_hit_points_are_drawn(rays):
-    figure = draw("floor", rays, people="Bob", rays=3, views=2)
+    figure = draw("floor", rays, participants="Bob", num_rays=3, num_views=2)
     lines, wedges = (c for c in figure.axes[0].collections if type(c).__name__ in ("LineCollection", "PatchCollection"))
     if type(lines).__name__ == "PatchCollection":
         lines, wedges = wedges, lines
@@ -521,7 +521,9 @@ def test_a_floor_plan_is_drawn_over_geometry(rgb, rays, tmp_path):
     assert "scene.xml" in text and "rays.npz" in text and str(tmp_path) not in text
 
 
-@pytest.mark.parametrize("options, said", [({"people": "Eve"}, "Eve"), ({"cut": 0.0}, "cut_height must be above")])
+@pytest.mark.parametrize(
+    "options, said", [({"participants": "Eve"}, "Eve"), ({"cut_height": 0.0}, "cut_height must be above")]
+)
 def test_wrong_options_of_a_floor_plan_are_refused(rays, options, said):
     with pytest.raises(NergError, match=said):
         draw("floor", rays, **options)
@@ -534,7 +536,7 @@ def test_a_figure_file_records_its_provenance(tmp_path):
     image = pytest.importorskip("PIL.Image", reason="Pillow is not installed")
     recorder = Recorder()
     a = write(tmp_path / "a.exr")
-    figure = draw("sheet", str(a), str(tmp_path / "new" / "b.png"), recorder, overlay="gaze", decades=2.0)
+    figure = draw("sheet", str(a), str(tmp_path / "new" / "b.png"), recorder, overlay="gaze", log_decades=2.0)
     width, height = (round(v) for v in figure.bbox.size)
     assert recorder.messages == [f"Wrote {tmp_path / 'new' / 'b.png'} ({width} x {height})."]
     with image.open(tmp_path / "new" / "b.png") as stored:

@@ -46,7 +46,15 @@ from tests.workflows.recorder import Recorder
 
 OPTIONS = GazeEvaluationOptions(min_rays=8, directions=128, resamples=2, pictures=1)
 TRAINING = GazeOptions(
-    geometry="none", radius=0.5, probes=8, steps=2, directions=64, zones=0, min_rays=8, test_zones=1, test_positions=3
+    geometry="none",
+    radius=0.5,
+    probes=8,
+    steps=2,
+    directions=64,
+    validation_zones=0,
+    min_rays=8,
+    test_zones=1,
+    test_positions=3,
 )
 
 
@@ -172,7 +180,7 @@ def test_the_next_look_needs_held_out_participants(trained):
 # ---- Folds: in workers, one of which is killed, with stored parts, and in this process ----
 
 
-SMALL = {"geometry": "none", "folds": 2, "zones": 1, "positions": 3, "radius": 0.6, "probes": 8, "steps": 2}
+SMALL = {"geometry": "none", "folds": 2, "test_zones": 1, "test_positions": 3, "radius": 0.6, "probes": 8, "steps": 2}
 SMALL |= {"directions": 128, "min_rays": 8, "splits": "both,pos", "threads": 1}
 
 
@@ -250,7 +258,7 @@ def test_stored_folds_are_not_trained_again(tmp_path, folds_trained):
         evaluate_folds(rays, tmp_path / "out", FoldOptions(**SMALL | changes, store=tmp_path / "store"), recorder)
         return list(folds_trained)
 
-    assert go() == [0, 1] and go() == [] and go(folds=4) == [2, 3] and go(first=2, folds=3) == [4]
+    assert go() == [0, 1] and go() == [] and go(folds=4) == [2, 3] and go(seed=2, folds=3) == [4]
     # Other rays or another recipe start another evaluation; a change of the schedule does not.
     assert go(crowd(301)) == [0, 1] and go(steps=3) == [0, 1] and go(threads=2) == []
     (job,) = account_for_store(tmp_path / "store").jobs

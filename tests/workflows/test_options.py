@@ -43,7 +43,7 @@ MODULES = [
 ]
 MODULES.append(importlib.import_module(StatisticsOptions.__module__))
 # Required options, if the defaults alone are not valid.
-SAID = {"FilterOptions": {"thin": 1.0}, "SplitOptions": {"zones": 3}}
+SAID = {"FilterOptions": {"thin": 1.0}, "SplitOptions": {"test_zones": 3}}
 KINDS = [
     kind
     for module in MODULES

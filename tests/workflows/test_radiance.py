@@ -178,7 +178,7 @@ def field(tmp_path):
 
 
 def test_a_field_and_its_file_give_equal_exports(field, tmp_path):
-    options, recorder = PointOptions(resolution=16, density=3.0, max_points=50), Recorder()
+    options, recorder = PointOptions(resolution=16, density_threshold=3.0, max_points=50), Recorder()
     first = export_points(field, tmp_path / "a.ply", options, recorder)
     second = export_points(load_radiance(field, ns)[0], tmp_path / "b.ply", options)
     assert first.files == [tmp_path / "a.ply"] and len(first.surface.vertices) == 50
@@ -191,7 +191,7 @@ def test_a_field_and_its_file_give_equal_exports(field, tmp_path):
 
 def test_exported_splats_are_on_the_surface(field, tmp_path):
     recorder = Recorder()
-    done = export_splats(field, tmp_path / "a.ply", SplatOptions(resolution=16, density=3.0), recorder)
+    done = export_splats(field, tmp_path / "a.ply", SplatOptions(resolution=16, density_threshold=3.0), recorder)
     splats = read_splats(tmp_path / "a.ply")
     assert done.files == [tmp_path / "a.ply"] and recorder.messages[0].startswith(f"{len(splats):,} Gaussians")
     assert (np.abs(splats.centers) < 1.3).all()

@@ -251,10 +251,10 @@ def test_files_are_imported_into_a_dataset(parquet, files, tmp_path):
     assert_same(result.rays, at_once.rays)
     assert result.summary.rays == 597 and result.lines[0][0] == "dataset" and at_once.lines == ()
     assert heard.messages == ["imported 3 sources, 597 rays"]
-    import_rays(files, options(output=output, place_name="shop"), heard)
+    import_rays(files, options(output=output, environment="shop"), heard)
     assert heard.messages[1] == "nothing to import; 3 unchanged"
     north = write_source(tmp_path / "north.csv", 5, 100)
-    card = import_rays([north], options(output=output, place_name="north"), heard)
+    card = import_rays([north], options(output=output, environment="north"), heard)
     assert card.summary.rays == 99 and len(RayDataset.open(output)) == 696
     assert [(title, c.summary.rays) for title, c in make_quality_report(output)] == [
         (f"{output}: north", 99),
@@ -293,7 +293,7 @@ def test_pseudonyms_of_datasets_match_those_of_files(parquet, files, tmp_path):
 @pytest.mark.parametrize(
     "arguments, why",
     [
-        ({"place_name": "x"}, "environment applies to datasets only; use an"),
+        ({"environment": "x"}, "environment applies to datasets only; use an"),
         ({"day": "2024-01-01", "output": "a.npz"}, "day applies to datasets only; use an output"),
         ({"workers": 0, "output": "a.rays"}, "workers must lie in"),
         ({"align_output": "a.json", "output": "a.rays"}, "align_output does not apply to datasets,"),
@@ -309,8 +309,8 @@ def test_wrong_dataset_options_are_refused(parquet, arguments, why):
     [
         {"persons": ("p0_0", "p2_1")},
         {"start": DAY + 1, "end": DAY + 2, "with_hit": True},
-        {"fixations": "ivt", "velocity": 1e5, "start": DAY + 1},
-        {"fixations": "idt", "dispersion": 170.0, "one_ray": True, "least": 0.05},
+        {"fixations": "ivt", "velocity_threshold": 1e5, "start": DAY + 1},
+        {"fixations": "idt", "dispersion_threshold": 170.0, "merge_fixations": True, "min_fixation": 0.05},
         {"thin": 0.5, "thin_distance": 9.0, "box": (0, 4, 0, 4, 0, 3)},
     ],
 )

@@ -222,7 +222,7 @@ def test_evaluations_of_another_field_are_refused_or_warned_about(without_3d, ru
 
 
 def test_a_report_without_geometry(tmp_path):
-    job = GazeOptions(geometry="none", radius=0.5, probes=8, steps=2, directions=64, zones=0, min_rays=8)
+    job = GazeOptions(geometry="none", radius=0.5, probes=8, steps=2, directions=64, validation_zones=0, min_rays=8)
     crowd(600).save(tmp_path / "rays.npz")
     train_gaze(tmp_path / "rays.npz", tmp_path / "gaze.safetensors", job)
     (tmp_path / "objects.json").write_text('{"a": [[0, 0, 0], [1, 1, 1]]}')

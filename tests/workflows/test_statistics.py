@@ -20,7 +20,7 @@ from tests.refusals import mentions
 
 from .recorder import Recorder
 
-FAST = {"resamples": 199, "eyes": 12, "directions": 512, "samples": 12, "mode": "llvm_ad_rgb"}
+FAST = {"resamples": 199, "viewpoints": 12, "directions": 512, "aoi_samples": 12, "mode": "llvm_ad_rgb"}
 
 
 @pytest.fixture(scope="module")
@@ -268,19 +268,19 @@ def test10_datasets_give_the_statistics_of_files(folder, tmp_path):
     [
         ([], {}, "give rays"),
         (["rays.npz", "rays.npz"], {}, "both a rays"),
-        (["rays.npz"], {"areas": None}, "aois"),
+        (["rays.npz"], {"aois": None}, "aois"),
         (["rays.npz"], {"windows": ("x",)}, "window"),
         (["rays.npz"], {"windows": ("x=2,1",)}, "window"),
         (["bare/scene.xml", "rays.npz"], {"what_if": "changes"}, "gaze field"),
         (["scene.xml"], {"observers": ("1,2",)}, "observer"),
         (["rays.npz"], {}, 'no shape "stand"'),
-        (["rays.npz"], {"pause": 0.1}, "must be at least max_gap"),
+        (["rays.npz"], {"session_gap": 0.1}, "must be at least max_gap"),
         (["rays.npz", "areas.json"], {}, "aois"),
         (["scene.xml", "rays.npz"], {"what_if": "changes"}, "is not one of move, remove, add, swap,"),
     ],
 )
 def test11_impossible_requests_are_refused(folder, names, options, said):
-    made = {"areas": folder / "areas.json", **FAST, **options}
+    made = {"aois": folder / "areas.json", **FAST, **options}
     if "what_if" in options:
         made["what_if"] = folder / "areas.json"
     with pytest.raises(NergError, match=said):

@@ -194,9 +194,9 @@ def test_bad_and_mirrored_fits_are_refused_unless_forced(tmp_path):
     [
         ({}, None, "or add pairs=FILE, tracking_surface=FILE,"),
         ({}, RAYS, "no scene is given: add field=FILE, scene"),
-        ({"cameras": "a"}, None, "tracking_cameras and scene_cameras must be"),
-        ({"pairs": "a", "twin": "b"}, None, "are alternatives"),
-        ({"pairs": "a", "start": "b"}, None, "are alternatives"),
+        ({"tracking_cameras": "a"}, None, "tracking_cameras and scene_cameras must be"),
+        ({"pairs": "a", "tracking_surface": "b"}, None, "are alternatives"),
+        ({"pairs": "a", "init": "b"}, None, "are alternatives"),
         ({"pairs": "PAIRS", "refine": True}, None, "refine=True needs the tracking"),
         ({"pairs": "PAIRS", "up": "north"}, None, "up must be comma-separated numbers, got"),
         ({"pairs": "PAIRS", "up": "0,0,0"}, None, "or three numbers x,y,z that are not all"),

@@ -35,7 +35,7 @@ from tests.workflows.recorder import Recorder
 # ---- The training of a gaze field, also by its command: geometries, recipes, hold-out, resuming, messages ----
 
 
-QUICK = GazeOptions(geometry="none", radius=0.5, probes=6, min_rays=8, steps=3, directions=64, zones=0)
+QUICK = GazeOptions(geometry="none", radius=0.5, probes=6, min_rays=8, steps=3, directions=64, validation_zones=0)
 WALL = """<scene version="3.0.0"><shape type="rectangle"><transform name="to_world">
     <scale value="2"/><lookat origin="1.5, 0, 1.5" target="0, 0, 1.5" up="0, 0, 1"/></transform></shape></scene>"""
 
@@ -115,7 +115,7 @@ def test_without_geometry_folds_select_the_variant(rays):
     assert any(m.endswith(f"the variant {mix['variant']} is trained") for m in heard.messages)
     # Without folds the variant is not selected.
     heard = Listener()
-    result = train_gaze(rays, options=replace(QUICK, mix_folds=0), reporter=heard)
+    result = train_gaze(rays, options=replace(QUICK, prior_folds=0), reporter=heard)
     assert result.field.config.variant == "capture" and "mix" not in result.provenance
     assert heard.messages[0] == "there is no geometry: capture alone is trained"
 
@@ -124,7 +124,8 @@ def test_function_and_command_write_equal_files(rays, tmp_path, capsys):
     rays.save(tmp_path / "rays.npz")
     options = replace(QUICK, geometry="hits", voxel_size=0.2, half=True, threads=1)
     train_gaze(tmp_path / "rays.npz", tmp_path / "job" / "gaze.safetensors", options)
-    line = "--geometry hits --voxel 0.2 --radius 0.5 --probes 6 --min-rays 8 --steps 3 --directions 64 --zones 0 --half"
+    line = "--geometry hits --voxel-size 0.2 --radius 0.5 --probes 6 --min-rays 8 --steps 3 --directions 64"
+    line += " --validation-zones 0 --half"
     code, said, _ = nerg(
         capsys, tmp_path / "rays.npz", "-o", tmp_path / "command" / "gaze.safetensors", *line.split(), "--threads", 1
     )
@@ -184,7 +185,7 @@ def test_a_registered_recipe_trains_from_function_and_command(rays, tmp_path, mo
     assert result.provenance["recipe"] == "coarse" and result.provenance["steps"] == 3
     RAYS.save(tmp_path / "rays.npz")
     out = tmp_path / "gaze.safetensors"
-    line = "--geometry hits --voxel 0.3 --recipe coarse --test-zones 1 --test-positions 4 --min-rays 8"
+    line = "--geometry hits --voxel-size 0.3 --recipe coarse --test-zones 1 --test-positions 4 --min-rays 8"
     code, _, said = nerg(capsys, tmp_path / "rays.npz", "-o", out, *line.split())
     assert code == 0, said
     field, meta = load_gaze(out, ns)
@@ -207,7 +208,7 @@ def test_held_out_positions_and_participants_are_reported(tmp_path):
 
 def test_an_interrupted_training_stops_the_script_and_reports_how_to_resume(rays, tmp_path):
     """The exception has the field so far."""
-    options = replace(QUICK, steps=8, fresh=True, threads=1, variant="capture", mix_folds=0)
+    options = replace(QUICK, steps=8, resample_directions=True, threads=1, variant="capture", prior_folds=0)
     with pytest.raises(TrainingInterrupted, match="4 steps") as end:
         train_gaze(rays, options=options, reporter=Listener(0.5))
     assert end.value.provenance["steps"] == 4 and end.value.provenance["interrupted"]
@@ -235,7 +236,7 @@ def test_the_command_resumes_a_training(tmp_path, monkeypatch, capsys):
     RAYS.save(tmp_path / "rays.npz")
     out = tmp_path / "gaze.safetensors"
     line = [tmp_path / "rays.npz", "-o", out, *"--geometry none --radius 0.5 --probes 6 --steps 8".split()]
-    line += "--directions 64 --zones 0 --fresh-directions --variant capture".split()
+    line += "--directions 64 --validation-zones 0 --resample-directions --variant capture".split()
     code, _, said = nerg(capsys, *line, "--resume")
     assert code == 1 and "there is no state to resume" in said
     step = GazeTrainer.step
@@ -266,7 +267,7 @@ def test_an_ensemble_is_one_option(tmp_path):
     from tests.train.gaze.test_ensemble import crowd
 
     out = tmp_path / "gaze.safetensors"
-    options = replace(QUICK, steps=2, zones=1, ensemble=2, half=True)
+    options = replace(QUICK, steps=2, validation_zones=1, ensemble=2, half=True)
     heard = Listener()
     train_gaze(crowd(), out, options, heard)
     field, meta = load_gaze(out, ns)
@@ -307,8 +308,8 @@ SCENE = Environment(None, BOX, "scene")
         (GazeOptions(geometry="hit"), False, '"hits".*"none".*"hit"'),
         (GazeOptions(geometry="none"), True, "there is no training data: give a rays file, or"),
         (replace(VIEWS, geometry="hits"), True, 'test_zones, geometry="hits", align,'),
-        (replace(VIEWS, mix_kappa=20.0), True, 'test_zones, geometry="hits", align,'),
-        (replace(VIEWS, mix_folds=2), True, 'test_zones, geometry="hits", align,'),
+        (replace(VIEWS, prior_kappa=20.0), True, 'test_zones, geometry="hits", align,'),
+        (replace(VIEWS, prior_folds=2), True, 'test_zones, geometry="hits", align,'),
         (replace(VIEWS, test_zones=1), True, 'test_zones, geometry="hits", align,'),
         (replace(VIEWS, salience=None), False, "saliency maps, or spectral-residual"),
         (replace(HITS, align_views=Path("a.json")), False, "saliency maps, or spectral-residual"),
@@ -319,10 +320,10 @@ SCENE = Environment(None, BOX, "scene")
         (replace(HITS, recipe="small", init="field"), False, 'init="field" needs a radiance field: add field'),
         (replace(HITS, recipe="small", semantic="snapshot"), False, "semantic"),
         (replace(HITS, loss="paper"), False, 'add recipe="small"'),
-        (replace(HITS, integral=1.0), False, "the recipe default does not support"),
-        (replace(HITS, recipe="small", mix_kappa=20.0), False, "the recipe small does not support"),
-        (replace(HITS, recipe="small", mix_folds=2), False, "the recipe small does not support"),
-        (replace(HITS, mix_kappa=2000.0), False, "the position-independent prior is stored in a"),
+        (replace(HITS, integral_weight=1.0), False, "the recipe default does not support"),
+        (replace(HITS, recipe="small", prior_kappa=20.0), False, "the recipe small does not support"),
+        (replace(HITS, recipe="small", prior_folds=2), False, "the recipe small does not support"),
+        (replace(HITS, prior_kappa=2000.0), False, "the position-independent prior is stored in a"),
         (replace(HITS, activation="exp"), False, "the recipe default does not support"),
         (replace(FIELD, loss="likelihood"), False, '"likelihood"'),
         (replace(HITS, recipe="large"), False, "one of default, small, paper"),

@@ -37,7 +37,7 @@ def walk(tmp_path):
 
 
 def test_filter(walk, tmp_path):
-    conditions = ["--person", "a", "--person", "c", "--from", 10, "--to", 30, "--box=0,3,0,3,0,3"]
+    conditions = ["--person", "a", "--person", "c", "--start", 10, "--end", 30, "--box=0,3,0,3,0,3"]
     done = run("filter", walk, "-o", tmp_path / "some.npz", *conditions)
     assert done.exit_code == 0, done.output
     some = Rays.load(tmp_path / "some.npz")
@@ -45,7 +45,7 @@ def test_filter(walk, tmp_path):
     assert some.t.min() >= 10 and some.t.max() < 30 and some.origin[:, 0].max() <= 3
     (step,) = some.metadata["steps"]
     assert (step["step"], step["kept"], step["of"], step["persons"]) == ("filter", len(some), 12_000, ["a", "c"])
-    fixations = ["--fixations", "idt", "--dispersion", 30, "--one-ray", "--thin", 1]
+    fixations = ["--fixations", "idt", "--dispersion-threshold", 30, "--merge-fixations", "--thin", 1]
     done = run("filter", tmp_path / "some.npz", "-o", tmp_path / "few.npz", *fixations)
     assert done.exit_code == 0, done.output
     few = Rays.load(tmp_path / "few.npz")
@@ -56,15 +56,15 @@ def test_filter(walk, tmp_path):
     "arguments, message",
     [
         (["filter"], "no selection is given"),
-        (["filter", "--one-ray"], "add --fixations"),
+        (["filter", "--merge-fixations"], "add --fixations"),
         (["filter", "--fixations", "magic"], "ivt or idt"),
-        (["filter", "--from", "1e9"], "selects none"),
+        (["filter", "--start", "1e9"], "selects none"),
         (["filter", "--box", "a,b"], "comma-separated numbers"),
         (["split"], "no criterion is given"),
         (["plot", "--kind", "map"], "density or layout"),
         (["plot", "--test", "walk.npz"], "add --kind layout"),
-        (["plot", "--cell=0"], "Invalid value for '--cell-size'"),
-        (["plot", "--cell=1e-5"], "more than 4,000,000 cells of 1e-05 m"),
+        (["plot", "--cell-size=0"], "Invalid value for '--cell-size'"),
+        (["plot", "--cell-size=1e-5"], "more than 4,000,000 cells of 1e-05 m"),
     ],
 )
 def test_wrong_arguments_are_refused(walk, tmp_path, monkeypatch, arguments, message):
@@ -82,10 +82,10 @@ def test_wrong_arguments_are_refused(walk, tmp_path, monkeypatch, arguments, mes
 @pytest.mark.parametrize(
     "how",
     [
-        ["--zones", 2, "--positions", 10, "--min-rays", 8],
-        ["--people", 0.5],
-        ["--time", 0.3, "--gap", 1],
-        ["--zones", 2, "--min-rays", 8, "--person", "b", "--time", 0.5, "--clock", "person"],
+        ["--test-zones", 2, "--test-positions", 10, "--min-rays", 8],
+        ["--test-participants", 0.5],
+        ["--test-time", 0.3, "--gap", 1],
+        ["--test-zones", 2, "--min-rays", 8, "--person", "b", "--test-time", 0.5, "--clock", "person"],
     ],
 )
 def test_split_shares_no_ray(walk, tmp_path, how):
@@ -97,7 +97,7 @@ def test_split_shares_no_ray(walk, tmp_path, how):
     assert set(train.t) | set(test.t) <= set(Rays.load(walk).t)
     step = test.metadata["steps"][-1]
     assert step["side"] == "test" and step["kept"] == len(test) and set(step["by"]) <= {"position", "person", "time"}
-    if "--positions" in how:
+    if "--test-positions" in how:
         centres = np.array(step["by"]["position"]["test_centres"])
         assert np.linalg.norm(train.origin[:, None] - centres[None], axis=2).min() > 0.5
         done = run("plot", sides[0], "-o", tmp_path / "s.png", "--kind", "layout", "--test", sides[1])

@@ -19,7 +19,7 @@ pytest.importorskip("pyarrow")
 def import_arguments(tmp_path):
     """The arguments of an import of two files, without the output."""
     files = [write_source(tmp_path / "files" / f"{k}.csv", k, 2000) for k in range(2)]
-    return ["rays", "import", *files, "--map", MAP, "--place-name", "shop"]
+    return ["rays", "import", *files, "--map", MAP, "--environment", "shop"]
 
 
 def test_a_dataset_is_imported_shown_filtered_and_split(import_arguments, tmp_path):
@@ -36,7 +36,7 @@ def test_a_dataset_is_imported_shown_filtered_and_split(import_arguments, tmp_pa
     assert done.exit_code == 0 and len(Rays.load(tmp_path / "b.npz")) == 100, done.output
     assert run("filter", output, "-o", tmp_path / "b.rays", "--person", "p0_1").exit_code == 0
     assert RayDataset.open(tmp_path / "b.rays").persons == ("p0_1",)
-    assert run("split", output, "-o", tmp_path / "c.npz", "--people", 0.5).exit_code == 0
+    assert run("split", output, "-o", tmp_path / "c.npz", "--test-participants", 0.5).exit_code == 0
     assert run("plot", output, "-o", tmp_path / "c.png").exit_code == 0
     assert len(Rays.load(tmp_path / "c-train.npz")) + len(Rays.load(tmp_path / "c-test.npz")) == 3998
 
