@@ -281,6 +281,8 @@ def _read_ply(path: str | os.PathLike) -> MeshFile:
     counts, corners = face.lists[names]() if names else (np.zeros(0, np.int64), np.zeros(0))
     if corners.dtype.kind == "f" and not ((corners == np.floor(corners)) & np.isfinite(corners)).all():
         raise ValueError("the vertex indices of its faces are not whole numbers")
+    if not face.count and ply.tables.get("tristrips", PlyTable(0)).count:
+        raise ValueError('its triangles are strips (the element "tristrips"), which are not read; export it as faces')
     missing = [name for name in _CENTER if vertex.count and name not in vertex.columns]
     if missing:
         raise ValueError(f'its vertices have no property "{missing[0]}"')

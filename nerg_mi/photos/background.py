@@ -84,14 +84,27 @@ def _find_background(cameras: list[PosedCamera], depths: list[np.ndarray]) -> di
     """Return masks (h, w) of pixels that are no surface by number of the view; None if there are none."""
     limit = _find_gap(cameras, depths)
     masks = {k: d >= limit for k, d in enumerate(depths) if d.max(initial=0) >= limit}
-    if not masks:
-        ahead = cache(lambda intrinsics: -pixel_directions(intrinsics)[..., 2].astype(np.float32))
-        masks = _find_repeated_maximum(cameras, depths, lambda k: depths[k] * ahead(cameras[k].intrinsics), _is_plane)
-    if not masks:
-        masks = _find_repeated_maximum(cameras, depths, lambda k: depths[k], _is_sphere)
+    masks = masks or _find_far_plane(cameras, depths)
     # If all depths are equal, none of them is the background of the others.
     count, total = sum(map(np.count_nonzero, masks.values())), sum(map(np.count_nonzero, depths))
     return masks if 0 < count <= (1 - _MIN_SURFACE_FRACTION) * total else None
+
+
+def measure_far_plane(cameras: list[PosedCamera], depths: list[np.ndarray]) -> Background | None:
+    """Return which fraction of depth maps has a maximum that is no surface, however few pixels show one; None if the
+    maximum is a surface."""
+    masks, size = _find_far_plane(cameras, depths), sum(d.size for d in depths)
+    if not masks:
+        return None
+    removed, finite = (sum(map(np.count_nonzero, arrays)) for arrays in (masks.values(), depths))
+    return Background(removed / size, 1 - finite / size, min(float(depths[k][m].min()) for k, m in masks.items()))
+
+
+def _find_far_plane(cameras: list[PosedCamera], depths: list[np.ndarray]) -> dict[int, np.ndarray]:
+    """Return the masks of a repeated maximum that is no surface, by distance across the image or along the rays."""
+    ahead = cache(lambda intrinsics: -pixel_directions(intrinsics)[..., 2].astype(np.float32))
+    masks = _find_repeated_maximum(cameras, depths, lambda k: depths[k] * ahead(cameras[k].intrinsics), _is_plane)
+    return masks or _find_repeated_maximum(cameras, depths, lambda k: depths[k], _is_sphere)
 
 
 def _find_gap(cameras: list[PosedCamera], depths: list[np.ndarray]) -> float:

@@ -13,7 +13,7 @@ from nerg_mi.maths.geometry import AnyBox, Box, ContractedBox, intersect_box_num
 from nerg_mi.ranges import MAX_COORDINATE
 
 from . import cameras
-from .background import remove_background
+from .background import measure_far_plane, remove_background
 from .cameras import PosedCamera, pixel_directions, project
 from .colmap import UpEstimate
 from .images import PhotoView, estimate_photo_up, load_usable_views, read_split
@@ -480,10 +480,16 @@ def open_dataset(
 
 
 def _check_depth(posed: PosedImages, views: list[PhotoView]) -> None:
-    """Raise `NergError` if the unit of the depth differs from that of the cameras."""
+    """Raise `NergError` if the unit of the depth differs from that of the cameras, or hardly any is a surface."""
     views_with_depth = [(v.camera, v.depth) for v in views if v.depth is not None]
     reason = explain_wrong_depth(views_with_depth) if views_with_depth else None
     if reason is not None:
+        background = measure_far_plane(*map(list, zip(*views_with_depth)))
+        if background is not None and background.fraction > 0.5:
+            raise NergError(
+                f'the depth of "{posed.path}" shows hardly any surface, {background}; render the depth again so that '
+                f"it shows the scene, or disable depth with {parameter('depth', False)}"
+            )
         raise NergError(
             f'the depth of "{posed.path}" does not match its cameras: {reason}; correct "depth_unit_scale_factor", '
             "the length of a unit of the depth files in metres (default: 0.001, for EXR 1), or disable depth with "

@@ -353,6 +353,16 @@ def test_invalid_obj_is_refused(tmp_path, text, said):
     assert "a.obj" in str(error.value) and "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize("allow_points", [False, True])
+def test_ply_with_strips_only_is_refused_for_them(tmp_path, allow_points):
+    vertices = "element vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+    strips = "element tristrips 1\nproperty list int int vertex_indices\n"
+    head = f"ply\nformat ascii 1.0\n{vertices}{strips}end_header\n"
+    (tmp_path / "a.ply").write_text(head + "0 0 0\n1 0 0\n0 1 0\n1 1 0\n5 0 1 2 3 -1\n")
+    with pytest.raises(NergError, match="tristrips"):
+        read_mesh_file(tmp_path / "a.ply", allow_points)
+
+
 def test_non_mesh_files_are_refused(tmp_path):
     with pytest.raises(NergError, match=r"ends in \.ply, \.obj"):
         read_mesh_file(tmp_path / "a.stl")

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from nerg_mi.errors import NergError
 from nerg_mi.photos.background import remove_background
 from nerg_mi.photos.cameras import Intrinsics, PosedCamera, pixel_directions
 from nerg_mi.photos.dataset import open_dataset
@@ -157,3 +158,24 @@ def test_equal_depths_everywhere_are_no_background():
     views = views_of(AROUND, [np.full((18, 24), 2.0)] * len(AROUND))
     assert remove_background(views)[1] is None
     assert remove_background([PhotoView("a", AROUND[0], np.zeros((18, 24, 3)))])[1] is None
+
+
+@pytest.mark.parametrize("surface", [0, 1])
+@pytest.mark.parametrize("value, along_rays", [(1e10, True), (1e10, False), (1e4, False)])
+def test_depth_that_is_nearly_all_background_is_refused_as_that(tmp_path, rgb, surface, value, along_rays):
+    """And not for its unit."""
+    frames = []
+    for k, camera in enumerate(AROUND):
+        depth = np.full((18, 24), value, np.float32)
+        depth[:surface, :2] = (see(camera) * (1 if along_rays else AHEAD))[:surface, :2]
+        np.save(tmp_path / f"{k}.npy", depth)
+        rgb.Bitmap(np.full((18, 24, 3), 10 * k, np.uint8)).write(str(tmp_path / f"i{k}.png"))
+        pose = camera.to_world.tolist()
+        frames.append({"file_path": f"i{k}.png", "depth_file_path": f"{k}.npy", "transform_matrix": pose})
+    content = {"fl_x": 15.0, "cx": 12.0, "cy": 9.0, "w": 24, "h": 18, "is_euclidean_depth": along_rays}
+    content |= {"depth_unit_scale_factor": 1.0, "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    with pytest.raises(NergError, match="background") as refusal:
+        open_dataset(tmp_path)
+    share = 1 - surface * 2 / (18 * 24)
+    assert f"{share:.1%}" in str(refusal.value) and "depth_unit_scale_factor" not in str(refusal.value)
