@@ -193,7 +193,7 @@ def _refuse(name: str, kind: str, expected: str, array: np.ndarray) -> NergError
         "values of the kind Period": "convert them first, with to_timestamp()",
     }.get(kind, "convert them first")
     example = f" such as {sanitize(str(array.ravel()[0]), 40)!r}" if array.size else ""
-    return NergError(f"{name} must be {expected}, but contain {kind}{example}; {remedy}")
+    return NergError(f"{name} must contain {expected}, got {kind}{example}; {remedy}")
 
 
 # ---- Names ----
@@ -284,8 +284,8 @@ def _check_rounding(array: np.ndarray, dtype: np.dtype, name: str) -> np.ndarray
     for value in array.ravel().tolist() if array.dtype.kind == "O" else array[np.isfinite(array)].tolist():
         if isinstance(value, (float, np.floating)) and limit <= abs(value) < np.inf:
             raise NergError(
-                f"{name} contain the floating-point number {value:.17g}, to which other integers are rounded, too; "
-                "read them as integers or text"
+                f"{name} must contain integers or text, got the floating-point number {value:.17g}, to which other "
+                "integers are rounded, too; read them as integers or text"
             )
     return array
 

@@ -121,7 +121,7 @@ def test_other_times_are_refused_by_name(times, kind):
 )
 def test_numbers_are_no_dates_text_or_flags(values):
     for array in (values, np.array([*values, None], object)):
-        with pytest.raises(NergError, match="origins must be numbers"):
+        with pytest.raises(NergError, match="origins must contain numbers"):
             to_numbers(array, "origins")
 
 

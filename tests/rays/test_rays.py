@@ -364,7 +364,7 @@ def broken(name, row, value):
         (broken("confidence", 0, 1.5), r"confidence outside \[0, 1\]"),
         ({"head": np.tile([[0.0, 0, 2], [np.nan, 0, 0]], (3, 1))}, r"head that is not of unit length \(rays 0, 2, 4\)"),
         ({"origin": np.zeros((5, 3))}, r"origin has shape \(5, 3\)"),
-        ({"t": ["now"] * 6}, '"t" of rays must be numbers'),
+        ({"t": ["now"] * 6}, '"t" of rays must contain numbers'),
         ({"head": [["x"] * 3] * 6}, '"head"'),
         ({"person": ["ann"] * 5 + ["cy"]}, r"'cy' is a person of the rays but not in persons"),
         ({"cohort": ["old"] * 6}, "'old'"),
