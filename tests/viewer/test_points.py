@@ -49,6 +49,15 @@ def test01_points_are_on_surfaces(room_scene):
     assert (lower > -3.01).all() and (upper < 3.01).all() and upper[2] > 0.9
 
 
+def test01c_points_are_as_bright_as_surfaces(room_scene):
+    """The light on shapes is the mean of several samples."""
+    eye = np.array([0, 0, 0.5])
+    proxy = last(gather_points(room_scene, [eye], max_positions=1))
+    directions = (proxy.points - eye) / np.linalg.norm(proxy.points - eye, axis=1, keepdims=True)
+    true = np.mean([nerg.trace(room_scene, eye, directions, ["color"], seed=seed).color for seed in range(4)], axis=0)
+    np.testing.assert_allclose(proxy.color.mean(axis=0), true.mean(axis=0), rtol=0.1)
+
+
 def test01b_points_are_on_splats(rgb):
     x, y = (v.ravel() for v in np.meshgrid(np.linspace(-2, 2, 21), np.linspace(-2, 2, 21)))
     n = len(x)
