@@ -341,7 +341,8 @@ class Shading:
     ) -> tuple[Color, list[Float], Bool]:
         """``(radiance, AOVs of the nested integrator, shown)`` from behind the medium, or from geometry without one.
 
-        Derivatives are those of the nested integrator or of the headlight; the default ``path`` has none.
+        Derivatives are those of the nested integrator, of the default ``path`` (in a derivative of an image, which
+        evaluates loops), or of the headlight.
 
         Parameters
         ----------
@@ -375,8 +376,8 @@ class Shading:
             return behind, [], shown
         hit = visible & ray_hit.hits_shape
         if len(scene.emitters()) > 0:
-            # Paths carry no derivatives: Dr.Jit has no reverse mode through their loop.
-            with dr.suspend_grad():
+            # Dr.Jit has no reverse mode through a symbolic loop of paths; derivatives of an image evaluate loops.
+            with dr.suspend_grad(when=dr.flag(dr.JitFlag.SymbolicLoops)):
                 self._path = self._path or mi.load_dict({"type": "path", "hide_emitters": bool(hide_emitters)})
                 shape = self._path.sample(scene, sampler, ray, None, hit)[0]
         else:

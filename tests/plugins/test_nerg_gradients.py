@@ -335,12 +335,19 @@ def test04_ray_batch_matches_its_pixels(rgb, files):
 # ---- The derivative of something that the march does not depend on ----
 
 
-@pytest.mark.parametrize("kind", ["grid", "field", "gaze", "refined"])
-def test_march_beside_a_differentiated_albedo_stays_one_kernel(rgb, learnt, kind):
+@pytest.mark.parametrize(
+    "kind, light",
+    [
+        *((kind, "nested") for kind in ("grid", "field", "gaze", "refined")),
+        *(("grid", light) for light in ("direct", "emitters", "headlight")),
+    ],
+)
+def test_march_beside_a_differentiated_albedo_stays_one_kernel(rgb, learnt, kind, light):
     """Mitsuba evaluates the loops of a derivative: each step would be a kernel, and take seconds per image."""
 
     def make(step):
-        path = {"inner": {"type": "path", "max_depth": 2}}
+        nested = {"nested": {"type": "path", "max_depth": 2}, "direct": {"type": "direct"}}
+        path = {"inner": nested[light]} if light in nested else {}
         if kind == "grid":
             data = rgb.TensorXf(np.full((4, 4, 4, 1), 1.5, np.float32))
             integrator = plugin(
@@ -358,8 +365,8 @@ def test_march_beside_a_differentiated_albedo_stays_one_kernel(rgb, learnt, kind
                     "gaze": stored("gazefield", learnt / "gaze.safetensors"),
                     "aovs": "depth,gaze,visibility",
                 }
-        ball, light = sphere(rgb, 0, 0, 3, radius=1.5), {"type": "constant"}
-        return scene_with(rgb, integrator, small_camera(rgb), ball=ball, light=light)
+        emitters = {} if light == "headlight" else {"light": {"type": "constant"}}
+        return scene_with(rgb, integrator, small_camera(rgb), ball=sphere(rgb, 0, 0, 3, radius=1.5), **emitters)
 
     counts = []
     for step in (0.2, 0.02):
