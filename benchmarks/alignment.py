@@ -73,19 +73,20 @@ class World:
 
 
 def make_world(shoppers: int, rays: int) -> World:
-    from nerg_mi.environment.environment import load_field_geometry
+    from nerg_mi.environment.environment import Environment
     from nerg_mi.scenes.store import twin
     from nerg_mi.scenes.store.layout import build_store
     from nerg_mi.scenes.store.shoppers import simulate_shoppers
     from nerg_mi.workflows.base import select_backend
 
-    ns, folder = select_backend("llvm_ad_rgb"), Path(twin.__file__).parent
+    select_backend("llvm_ad_rgb")
+    folder = Path(twin.__file__).parent
     ids, times, origin, direction = simulate_shoppers(build_store(0), shoppers=shoppers, seed=5)
     persons, person = np.unique(ids, return_inverse=True)
     hit = origin + direction * twin.cast_rays(origin, direction)[:, None]
     hit += np.random.default_rng(1).normal(0, 0.02, hit.shape)
     walked = Rays(times / 1000, person, tuple(persons), origin, direction, np.ones(len(ids)), hit)
-    place = load_field_geometry(folder / "store.safetensors", ns)
+    place = Environment.open(folder / "store.safetensors")
     assert place.medium is not None
     traces = trace_scene(place.medium, np.array(place.box.lower), np.array(place.box.upper), rays)
     return World(traces, read_surface(folder / "twin.ply"), walked)
@@ -234,14 +235,14 @@ def cells(row: dict) -> list[str]:
 def list_hidden(world: World, folder: Path) -> Iterator[tuple[str, SceneTraces | None, Rays]]:
     """Names, traces and recordings. Without traces, the surface is what the gaze of other participants meets."""
     import generated_places
-    from nerg_mi.environment.environment import load_scene_geometry
+    from nerg_mi.environment.environment import Environment
     from nerg_mi.rays.readers.registry import read_rays
 
     yield "demo store", world.traces, world.rays
     for make in generated_places.PLACES:
         place = make()
         scene = place.write(folder / f"{place.name}.xml")
-        core = load_scene_geometry(scene)
+        core = Environment.open(scene)
         assert core.medium is not None
         traces = trace_scene(core.medium, np.array(core.box.core.lower), np.array(core.box.core.upper), 100_000)
         yield place.name, traces, place.record(scene, seconds=120.0, seed=1)

@@ -31,7 +31,7 @@ def main(argv=None) -> None:
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
-    from nerg_mi.environment.environment import load_field_geometry, load_volume_geometry
+    from nerg_mi.environment.environment import Environment
     from nerg_mi.fields.mlp import namespace
     from nerg_mi.formats.fields import load_gaze
     from nerg_mi.transport.geometry import SceneGeometry, default_march_settings
@@ -61,9 +61,7 @@ def main(argv=None) -> None:
     args = parser.parse_args(argv)
     ns = namespace("llvm_ad_rgb")
     field, _ = load_gaze(args.gaze, ns)
-    medium = (
-        load_volume_geometry(args.place) if args.place.suffix == ".vol" else load_field_geometry(args.place, ns)
-    ).medium
+    medium = Environment.open(args.place).medium
     gaze, place, settings = (
         GazeFieldInstance(field),
         SceneGeometry(medium),

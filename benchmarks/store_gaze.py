@@ -42,7 +42,7 @@ def main(argv=None) -> None:
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
-    from nerg_mi.environment.environment import load_field_geometry
+    from nerg_mi.environment.environment import Environment
     from nerg_mi.evaluation.baselines import make_tuned_baselines
     from nerg_mi.evaluation.gaze import EPS, FieldDensity, compute_map_scores
     from nerg_mi.fields.mlp import namespace
@@ -88,7 +88,7 @@ def main(argv=None) -> None:
     if "test" not in metadata:
         raise SystemExit(f'"{args.gaze}" was trained without held-out positions; train it with --test-zones 8')
     rays, law = Rays.load(args.rays), AttentionLaw()
-    geometry = load_field_geometry(args.field, ns)
+    geometry = Environment.open(args.field)
     positions, radius = np.array(metadata["test"]["centres"]), metadata["test"]["radius"]
     train = rays.select(purge(rays, positions, metadata["test"]["purged_within"]))
     directions = fibonacci_directions(DIRECTIONS)

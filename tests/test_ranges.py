@@ -20,7 +20,7 @@ import nerg_mi.rays.readers
 import nerg_mi.workflows
 from nerg_mi import errors, properties
 from nerg_mi.cli.building import build_command
-from nerg_mi.environment.environment import load_scene_geometry, load_volume_geometry
+from nerg_mi.environment.environment import Environment
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation.metrics import FieldRenderer
 from nerg_mi.formats.surfaces import write_volume
@@ -352,12 +352,12 @@ def test_plugin_bug_is_not_a_user_error():
 
 def _mesh(folder):
     (folder / "file.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
-    return lambda: load_scene_geometry(folder / "file.obj")
+    return lambda: Environment.open(folder / "file.obj")
 
 
 def _volume(folder):
     write_volume(folder / "file.vol", np.ones((2, 2, 2), np.float32), (0, 0, 0), (1, 1, 1))
-    return lambda: load_volume_geometry(folder / "file.vol")
+    return lambda: Environment.open(folder / "file.vol")
 
 
 def _camera_of_photo(folder):

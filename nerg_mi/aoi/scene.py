@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from nerg_mi.environment import environment as geometry
 from nerg_mi.environment.environment import Environment
 from nerg_mi.errors import NergError, sanitize, translate_mitsuba_errors
 from nerg_mi.files.safe_read import read_json
@@ -207,12 +206,12 @@ def load_gaze_scene(
     if gaze is not None:
         network, metadata = load_gaze(gaze, ns)
         provenance = metadata.get("provenance", metadata)
-        training_geometry = load_training_geometry(gaze, provenance, network.box, ns, field=field)
+        training_geometry = load_training_geometry(gaze, provenance, network.box, field=field)
         return _gaze_scene_from_training(
             training_geometry, GazeFieldInstance(network), align or training_geometry.align
         )
     if field is not None:
-        return _gaze_scene_from_training(geometry.load_field_geometry(field, ns), None, align or Similarity())
+        return _gaze_scene_from_training(Environment.open(field), None, align or Similarity())
     return GazeScene(None, None, align or Similarity())
 
 

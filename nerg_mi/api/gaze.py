@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from nerg_mi.environment.environment import Environment
+from nerg_mi.environment.kinds import ENVIRONMENTS, detect_kind
 from nerg_mi.environment.trained import TrainedField
 from nerg_mi.errors import NergError, sanitize, translate_mitsuba_errors
 from nerg_mi.fields.gaze_base import AnyGazeField
@@ -25,7 +27,6 @@ from nerg_mi.progress import Reporter
 from nerg_mi.ranges import DIRECTIONS, Range, check_number
 from nerg_mi.rays.rays import Rays, sample_rows
 from nerg_mi.rendering.scene import get_array_module
-from nerg_mi.workflows.scene_environments import ENVIRONMENTS, detect_kind
 
 from .arrays import Floats, as_points, as_rays
 from .calls import Progress, report_progress
@@ -387,25 +388,11 @@ class TrainedGazeField(TrainedField[AnyGazeField]):
 
     def _load_space(self, path: Path) -> _ObserverSpace:
         """Return the space of a geometry file; the last one is cached until the file changes."""
-        from nerg_mi.environment import environment as geometry
-
         status = path.stat()
         key = path.resolve(), status.st_mtime_ns, status.st_size
         if key not in self._spaces:
-            kind = detect_kind(path)
-            if kind not in ENVIRONMENTS:
-                raise NergError(
-                    f'the geometry "{path}" contains {"rays" if kind == "rays" else "a gaze field"}; give a scene, '
-                    "a mesh, a radiance field, splats or a volume of hit points (.vol)"
-                )
-            if kind == "field":
-                loaded = geometry.load_field_geometry(path, self.network.ns)
-            elif kind == "hits":
-                loaded = geometry.load_volume_geometry(path)
-            else:
-                loaded = geometry.load_scene_geometry(path)
             self._spaces.clear()
-            self._spaces[key] = self._make_space(loaded.medium)
+            self._spaces[key] = self._make_space(Environment.open(path).medium)
         return self._spaces[key]
 
     def _find_training_file(self) -> Path:

@@ -26,6 +26,7 @@ from nerg_mi.environment.contents import (
     to_scene_children,
     write_content,
 )
+from nerg_mi.environment.kinds import detect_kind
 from nerg_mi.environment.trained import TrainedField
 from nerg_mi.errors import NergError
 from nerg_mi.fields.radiance import RadianceField
@@ -40,7 +41,6 @@ from nerg_mi.progress import WarningReporter
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.files import write_mesh
 from nerg_mi.rendering.scene import activate_mitsuba, list_scene_files
-from nerg_mi.workflows.scene_environments import detect_kind
 
 from .arguments import check_names, resolve_file
 from .scene import Scene, make_scene

@@ -2,32 +2,36 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import MissingFile, NergError, parameter, translate_mitsuba_errors
+from nerg_mi.errors import MissingFile, NergError, translate_mitsuba_errors
 from nerg_mi.fields.radiance import RadianceField
+from nerg_mi.fields.splats import Splats
 from nerg_mi.files.atomic import file_sha256
 from nerg_mi.formats.fields import load_radiance
-from nerg_mi.formats.meshes import READERS as MESHES
 from nerg_mi.formats.meshes import read_mesh_file
-from nerg_mi.formats.splats import READERS, is_splat_file, read_splats, refuse_unsupported_splats
+from nerg_mi.formats.splats import is_splat_file, read_splats
 from nerg_mi.formats.surfaces import write_volume
 from nerg_mi.maths.geometry import AnyBox, Box, Similarity
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.files import check_vol
-from nerg_mi.rendering.scene import load_scene
+from nerg_mi.rendering.scene import get_array_module, load_scene
 from nerg_mi.transport.field_medium import FieldMedium
 from nerg_mi.transport.geometry import SceneGeometry
 from nerg_mi.transport.mitsuba_mesh import make_mesh
 from nerg_mi.transport.splat_medium import SplatArrays, SplatMedium
 from nerg_mi.transport.volume_medium import VolumeMedium
 
+from .contents import DensityGrid, load_content, to_scene_children
 from .hits import compute_hit_extent, make_volume_dict, voxelise_hits
+from .kinds import detect_kind
+from .trained import TrainedField
 
 DEFAULT_DEPTH = 2.0  # Distance of the surface points if there is no geometry, in units of the field
 
@@ -58,6 +62,52 @@ class Environment:
         """The geometry as that of a scene; empty without geometry."""
         return self.medium if isinstance(self.medium, SceneGeometry) else SceneGeometry(self.medium)
 
+    @classmethod
+    def open(cls, environment: Any) -> Environment:
+        """Open what observers see; the Mitsuba variant must be active.
+
+        Parameters
+        ----------
+        environment : object
+            A file (radiance field, splats, mesh, Mitsuba scene, volume of hit points), a `TrainedField`, a radiance
+            field, splats, a `DensityGrid`, a Mitsuba scene, or shapes as for `to_scene_children`: a mesh or scene of
+            trimesh, a dict for ``mi.load_dict``, a Mitsuba shape, or several of these. An `Environment` is returned
+            as it is.
+
+        Returns
+        -------
+        Environment
+            The environment, in its own frame (``align`` is the identity). Of a file, ``metadata`` has the checksum.
+
+        Raises
+        ------
+        NergError
+            The file does not exist or is damaged, or ``environment`` is something else.
+        """
+        import mitsuba as mi
+
+        if isinstance(environment, Environment):
+            return environment
+        if isinstance(environment, (str, os.PathLike)):
+            return _open_file(Path(environment))
+        if isinstance(environment, TrainedField):
+            if environment.path is not None:
+                return _open_file(environment.path)
+            environment = environment.network
+        if isinstance(environment, RadianceField):
+            return _open_radiance(environment, "the radiance field")
+        if isinstance(environment, Splats):
+            return _open_splats(environment)
+        if isinstance(environment, DensityGrid):
+            medium = VolumeMedium(mi.load_dict(environment.volumes()["density"].load()))
+            lower, upper = medium.bounds()
+            return Environment(medium, Box(tuple(lower.tolist()), tuple(upper.tolist())), "scene")
+        if not isinstance(environment, mi.Scene):
+            is_scene = isinstance(environment, Mapping) and environment.get("type") == "scene"
+            content = environment if is_scene else {"type": "scene", **to_scene_children(environment, "environment")}
+            environment = load_content(content)
+        return _open_scene(environment, "the environment")
+
     def points_to_field(self, points: np.ndarray) -> np.ndarray:
         """Transform points (..., 3) from the frame of the rays to that of the field."""
         return points @ self.align.matrix[:3, :3].T + self.align.matrix[:3, 3]
@@ -72,54 +122,64 @@ class Environment:
         return directions @ (self.align.matrix[:3, :3] / self.align.scale)
 
 
-def load_field_geometry(path: Path, ns: ModuleType) -> Environment:
-    """Load a radiance field or Gaussian splats from ``path`` with the Dr.Jit backend ``ns``."""
-    if path.suffix.lower() in READERS:
-        return _load_splat_geometry(path, ns)
-    refuse_unsupported_splats(path)
-    radiance, _ = load_radiance(path, ns)
-    radiance.require_density(f'"{path}"')
+def _open_file(path: Path) -> Environment:
+    """Open an environment in a file. Raises `NergError` for a file with anything else."""
+    kind = detect_kind(path)
+    if kind == "hits":
+        return _open_volume(path)
+    if kind in ("mesh", "scene"):
+        return _open_scene_file(path, kind)
+    if kind != "field":
+        raise NergError(
+            f'"{path}" contains {"rays" if kind == "rays" else "a gaze field"} and is no environment; give a scene, a '
+            "mesh, a radiance field, splats or a volume of hit points (.vol)"
+        )
     metadata = {"field_file": identify_file(path)}
-    return Environment(FieldMedium(radiance), radiance.box, "field", metadata, radiance=radiance)
+    if is_splat_file(path):
+        return replace(_open_splats(read_splats(path)), metadata=metadata)
+    radiance, _ = load_radiance(path, get_array_module())
+    return replace(_open_radiance(radiance, f'"{path}"'), metadata=metadata)
 
 
-def _load_splat_geometry(path: Path, ns: ModuleType) -> Environment:
-    splats = read_splats(path)
+def _open_radiance(radiance: RadianceField, name: str) -> Environment:
+    radiance.require_density(name)
+    return Environment(FieldMedium(radiance), radiance.box, "field", radiance=radiance)
+
+
+def _open_splats(splats: Splats) -> Environment:
     # Splats trained on photos have outliers far away.
     lower, upper = np.quantile(splats.centers.astype(np.float64), (_OUTLIER_FRACTION, 1 - _OUTLIER_FRACTION), axis=0)
     pad = _RELATIVE_MARGIN * max(upper - lower) + float(splats.scales.max(axis=1).mean())
     box = Box(tuple(lower - pad), tuple(upper + pad))
-    medium, metadata = SplatMedium(SplatArrays(splats, ns)), {"field_file": identify_file(path)}
-    return Environment(medium, box, "field", metadata, notes=(*splats.assumptions, *splats.notes))
+    medium = SplatMedium(SplatArrays(splats, get_array_module()))
+    return Environment(medium, box, "field", notes=(*splats.assumptions, *splats.notes))
 
 
-def load_scene_geometry(path: Path) -> Environment:
-    """Load a Mitsuba scene or a mesh (.ply, .obj, .glb).
-
-    The geometry consists of the shapes of the scene and, if its integrator is a ``nerg``, of the field or volume.
-    Raises `NergError` for a scene with neither.
-    """
-    scene, notes = _load_mesh_scene(path) if path.suffix.lower() in MESHES else (load_scene(path), ())
-    scene_geometry = SceneGeometry(getattr(scene.integrator(), "medium", None), scene)
-    bounds = scene_geometry.bounds()
+def _open_scene(scene: Any, name: str) -> Environment:
+    """Open a Mitsuba scene: its shapes and, if its integrator is a ``nerg``, the field or volume."""
+    geometry = SceneGeometry(getattr(scene.integrator(), "medium", None), scene)
+    bounds = geometry.bounds()
     if bounds is None:
-        raise NergError(f'the scene "{path}" has no shapes and no field; pass a scene with at least one of them')
+        raise NergError(f"{name} has no shapes and no field; pass a scene with at least one of them")
     lower, upper = bounds
     # A field needs a box with some thickness, and a plane has none.
     pad = 0.01 * max(upper - lower)
-    box, metadata = Box(tuple(lower - pad), tuple(upper + pad)), {"scene_file": identify_file(path)}
-    return Environment(scene_geometry, box, "scene", metadata, notes=notes)
+    return Environment(geometry, Box(tuple(lower - pad), tuple(upper + pad)), "scene")
 
 
-def _load_mesh_scene(path: Path) -> tuple[Any, tuple[str, ...]]:
-    """Load the mesh in ``path`` as a scene, with notes on unused content of the file."""
+def _open_scene_file(path: Path, kind: str) -> Environment:
     import mitsuba as mi
 
-    if path.suffix.lower() in READERS and is_splat_file(path):
-        raise NergError(f'"{path}" contains Gaussian splats, not a mesh; pass it with {parameter("field")}')
-    mesh = read_mesh_file(path)
-    with translate_mitsuba_errors(path):
-        return mi.load_dict({"type": "scene", "mesh": make_mesh(mesh.vertices, mesh.faces, "mesh")}), mesh.notes
+    notes: tuple[str, ...] = ()
+    if kind == "mesh":
+        mesh = read_mesh_file(path)
+        notes = mesh.notes
+        with translate_mitsuba_errors(path):
+            scene = mi.load_dict({"type": "scene", "mesh": make_mesh(mesh.vertices, mesh.faces, "mesh")})
+    else:
+        scene = load_scene(path)
+    opened = _open_scene(scene, f'the scene "{path}"')
+    return replace(opened, metadata={"scene_file": identify_file(path)}, notes=notes)
 
 
 def make_hit_geometry(rays: Rays, path: Path, voxel: float | None = None) -> Environment:
@@ -136,10 +196,10 @@ def make_hit_geometry(rays: Rays, path: Path, voxel: float | None = None) -> Env
         "voxel": extent.voxel,
         "beyond": round(extent.outside_fraction, 4),
     }
-    return load_volume_geometry(path, size)
+    return _open_volume(path, size)
 
 
-def load_volume_geometry(path: Path, metadata: dict | None = None) -> Environment:
+def _open_volume(path: Path, metadata: dict | None = None) -> Environment:
     """Load a volume written by `make_hit_geometry`. Raises `NergError` if it is missing or damaged."""
     import mitsuba as mi
 

@@ -116,7 +116,7 @@ _OTHER_CONTENT = {
 
 def find_other_content(path: str | os.PathLike) -> str | None:
     """Return what a file that cannot be read is instead, with the remedy; None if that is unknown."""
-    if str(path).lower().endswith(".gz") or not os.path.isfile(path):
+    if str(path).lower().endswith((".gz", ".spz")) or not os.path.isfile(path):
         return None
     try:
         with open(path, "rb") as file:

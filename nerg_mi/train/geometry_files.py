@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 
@@ -45,7 +44,6 @@ def make_geometry(
     rays: Rays | None,
     views: Sequence[SalienceView],
     volume: Path | None,
-    ns: ModuleType,
     voxel: float | None = None,
     reporter: Reporter = SILENT,
 ) -> Environment:
@@ -61,8 +59,6 @@ def make_geometry(
         Views with saliency.
     volume
         File (.vol) for a geometry of hit points.
-    ns
-        Backend of its arrays.
     voxel
         Edge length of voxels in metres, for hit points.
     reporter
@@ -76,9 +72,7 @@ def make_geometry(
     kind = geometry_kind(options)
     if options.field is not None or options.scene is not None:
         path = Path(options.field or options.scene or "")
-        environment = (
-            geometry.load_field_geometry(path, ns) if options.field is not None else geometry.load_scene_geometry(path)
-        )
+        environment = Environment.open(path)
         for note in environment.notes:
             reporter.message(f"{path}: {note}")
         return environment
@@ -108,7 +102,6 @@ def load_training_geometry(
     gaze: Path,
     provenance: dict,
     box: AnyBox,
-    ns: ModuleType,
     *,
     field: Path | None = None,
     scene: Path | None = None,
@@ -126,19 +119,11 @@ def load_training_geometry(
         choice = None
     if provenance.get("geometry") == "none":
         return Environment(None, box, "none", align=align)
-    makers: dict[str, tuple[Path | None, str, Callable[[Path], Environment]]] = {
-        "field_file": (field, parameter("field"), lambda path: geometry.load_field_geometry(path, ns)),
-        "scene_file": (scene, parameter("scene"), geometry.load_scene_geometry),
-        "geometry_file": (
-            None if choice is None else Path(choice),
-            parameter("geometry"),
-            geometry.load_volume_geometry,
-        ),
-    }
-    key = geometry_key(gaze, provenance)
-    explicit, name, make = makers[key]
-    path = find_training_file(gaze, provenance, explicit, f"name it with {name}", f"give the right one with {name}")
-    return replace(make(path), align=align)
+    options = {"field_file": (field, "field"), "scene_file": (scene, "scene"), "geometry_file": (choice, "geometry")}
+    explicit, name = options[geometry_key(gaze, provenance)]
+    remedies = f"name it with {parameter(name)}", f"give the right one with {parameter(name)}"
+    path = find_training_file(gaze, provenance, None if explicit is None else Path(explicit), *remedies)
+    return replace(Environment.open(path), align=align)
 
 
 def _check_trained_kind(gaze: Path, provenance: dict, kind: str) -> None:

@@ -13,7 +13,6 @@ from nerg_mi.alignment.icp import Twin
 from nerg_mi.alignment.points import read_cameras, read_pairs
 from nerg_mi.alignment.similarity import transform_points
 from nerg_mi.alignment.tracking import Tracking, compare_flips
-from nerg_mi.environment import environment as geometry
 from nerg_mi.environment.environment import Environment
 from nerg_mi.errors import NergError, parameter
 from nerg_mi.figures.maps import alignment_figure
@@ -180,13 +179,9 @@ def _target(options: AlignOptions, kind: str, reporter: Reporter) -> tuple[Envir
         return None, AlignmentTarget(**common)
     if options.surface is not None:
         return None, AlignmentTarget(points=read_surface(options.surface, on_note=reporter.message), **common)
-    ns = select_backend(options.mode, options.threads)
+    select_backend(options.mode, options.threads)
     reporter.progress(0.02, "tracing the scene")
-    environment = (
-        geometry.load_field_geometry(options.field, ns)
-        if options.field is not None
-        else geometry.load_scene_geometry(_path(options.scene))
-    )
+    environment = Environment.open(options.field or _path(options.scene))
     for note in environment.notes:
         reporter.message(f"{options.field or options.scene}: {note}")
     assert environment.medium is not None

@@ -150,7 +150,7 @@ def evaluate_gaze(
         scored, centres, account["radius"], options.kappa, options.directions, options.min_rays, seed=seed
     )
     environment = load_training_geometry(
-        gaze, training, loaded.box, ns, field=options.field, scene=options.scene, choice=options.geometry
+        gaze, training, loaded.box, field=options.field, scene=options.scene, choice=options.geometry
     )
     option = f"--{environment.kind} {options.field or options.scene or 'FILE'}"
     # A field that was trained with --force is scored, with a warning.

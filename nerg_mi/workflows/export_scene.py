@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from nerg_mi.environment.kinds import detect_kind
 from nerg_mi.errors import NergError, parameter, translate_mitsuba_errors
 from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.figures.overlay import Heat, robust_max
@@ -47,7 +48,6 @@ from .draw_scenes import copy_sampler, make_film, upright_pose
 from .radiance_commands import SceneExportOptions
 from .rays_events import warn_slow_sampling
 from .render import warn_observer
-from .scene_environments import detect_kind
 
 _SPHERE_RADIUS = 0.15  # metres
 _SPHERE_WIDTH = 96

@@ -127,7 +127,7 @@ def evaluate_next_look(
     if not holdout.get("people"):
         raise NergError(f'"{gaze}" held out no participants to score; train with {parameter("test_participants", 0.5)}')
     environment = load_training_geometry(
-        gaze, training, loaded.box, ns, field=options.field, scene=options.scene, choice=options.geometry
+        gaze, training, loaded.box, field=options.field, scene=options.scene, choice=options.geometry
     )
     field = FieldDensity(
         loaded, environment.medium, environment.align, training.get("probes", {}).get("depth", "median")

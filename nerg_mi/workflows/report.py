@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.environment.environment import Environment
+from nerg_mi.environment.kinds import ENVIRONMENTS, KINDS, detect_kind
 from nerg_mi.errors import MissingFile, NergError, parameter, sanitize, translate_mitsuba_errors
 from nerg_mi.evaluation.gaze_report import GazeResults, read_results
 from nerg_mi.fields.gaze_base import AnyGazeField, tracking_suffix
@@ -68,7 +69,7 @@ from .render import describe_basis, describe_smoothing, is_supported, smooth_gaz
 from .scene import SceneResult, write_scene
 from .scene_cameras import support_of_rays, to_scene_frame
 from .scene_commands import ReportOptions, SceneOptions
-from .scene_environments import ENVIRONMENTS, KINDS, InputFiles, detect_kind, recognise
+from .scene_environments import InputFiles, recognise
 
 # ---- Input files, recognised by their content ----
 

@@ -10,12 +10,13 @@ import numpy as np
 
 from nerg_mi.environment.environment import DEFAULT_DEPTH
 from nerg_mi.environment.hits import shade_hits
-from nerg_mi.errors import MissingFile, NergError, parameter, sanitize
-from nerg_mi.files.safe_read import check_regular_file, resolve_path, translate_read_errors
+from nerg_mi.environment.kinds import ENVIRONMENTS, KINDS, detect_kind
+from nerg_mi.errors import NergError, parameter, sanitize
+from nerg_mi.files.safe_read import resolve_path, translate_read_errors
 from nerg_mi.formats.checkpoint import read_metadata
 from nerg_mi.formats.fields import matches_checksum
-from nerg_mi.formats.meshes import DEFAULT_GREY, READERS, MeshFile, read_mesh_file, with_shading_normals
-from nerg_mi.formats.splats import choose_plugin, is_splat_file, read_splats, refuse_unsupported_splats
+from nerg_mi.formats.meshes import DEFAULT_GREY, MeshFile, read_mesh_file, with_shading_normals
+from nerg_mi.formats.splats import choose_plugin, is_splat_file, read_splats
 from nerg_mi.formats.surfaces import write_volume
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.transforms import invert_similarity
@@ -23,7 +24,7 @@ from nerg_mi.photos.colmap import find_pose_source
 from nerg_mi.photos.images import read_photo, read_posed_images
 from nerg_mi.photos.posed import PosedFrame, PosedImages
 from nerg_mi.progress import Reporter
-from nerg_mi.rays.dataset import is_dataset, load_rays
+from nerg_mi.rays.dataset import load_rays
 from nerg_mi.rendering.files import check_vol, write_mesh
 from nerg_mi.rendering.nested_scene import GAZE_PROPERTIES, nest_scene
 from nerg_mi.rendering.scene_writer import (
@@ -42,13 +43,8 @@ from nerg_mi.transport.geometry import HEADLIGHT
 
 # ---- Input files, recognised by their content ----
 
-KINDS = {".npz": "rays", ".parquet": "rays", **dict.fromkeys(READERS, "mesh"), ".vol": "hits", ".xml": "scene"}
-"""Kinds of files by suffix, except checkpoints."""
-
 _SOME = 4096
 """Number of rays of a dataset that are checked for hit points."""
-
-ENVIRONMENTS = ("field", "mesh", "hits", "scene")
 
 
 @dataclass(frozen=True)
@@ -87,34 +83,6 @@ class InputFiles:
         return read_training_alignment(self.gaze_provenance)
 
 
-def detect_kind(path: Path) -> str:
-    """Return the content of ``path``: "field", "gaze", or a value of `KINDS`. Raises `NergError` for other files."""
-    if not path.exists():
-        raise MissingFile(f'there is no file "{path}"; correct its name')
-    if is_dataset(path):
-        return "rays"
-    check_regular_file(path)
-    suffix = path.suffix.lower()
-    if suffix == ".safetensors":
-        kind = read_metadata(path).get("kind")
-        if kind not in ("radiance", "gaze"):
-            raise NergError(
-                f'"{path}" contains a {sanitize(kind, 40)} field; a scene can show radiance and gaze fields'
-            )
-        return {"radiance": "field", "gaze": "gaze"}[kind]
-    if is_splat_file(path):
-        return "field"
-    refuse_unsupported_splats(path)
-    if suffix in (".pth", ".pt"):
-        raise NergError(f'"{path}" is a PyTorch checkpoint; convert it with "nerg import"')
-    if suffix not in KINDS:
-        raise NergError(
-            f'"{path}" cannot be shown in a scene; give checkpoints (.safetensors), splats, rays, datasets of '
-            f"rays, meshes or scenes ({', '.join(KINDS)})"
-        )
-    return KINDS[suffix]
-
-
 def recognise(files: Sequence[Path], geometry: str | None, reporter: Reporter) -> InputFiles:
     """Detect the kind of each of ``files``. If they contain a gaze field and no geometry, use the geometry file of its
     training, which must be in the folder of the gaze field.
@@ -129,7 +97,9 @@ def recognise(files: Sequence[Path], geometry: str | None, reporter: Reporter) -
         kind = detect_kind(path)
         role = "environment" if kind in ENVIRONMENTS else kind
         if role in by_role:
-            raise NergError(f'"{by_role[role][1]}" and "{path}" are both a {role}, and a scene can have one')
+            raise NergError(
+                f'"{by_role[role][1]}" and "{path}" have the same role ({role}), and a scene can have one of each'
+            )
         by_role[role] = kind, path
     if not by_role:
         raise NergError("a scene needs a field, a mesh, a scene file, a gaze field or rays; name at least one")

@@ -34,6 +34,7 @@ from nerg_mi.aoi.predicted import (
     what_if_rows,
 )
 from nerg_mi.aoi.scene import read_changes
+from nerg_mi.environment.kinds import detect_kind
 from nerg_mi.errors import NergError, parameter
 from nerg_mi.files.atomic import check_folder, make_folder
 from nerg_mi.formats.areas import AreaSet, read_areas
@@ -60,7 +61,6 @@ from nerg_mi.rays.rays import TRACKING, Rays
 
 from .base import select_backend
 from .parts import PartRunner
-from .scene_environments import detect_kind
 from .statistics_parts import PartitionedStatistics
 
 

@@ -236,7 +236,7 @@ def _train(
         reporter.progress(0.0, "reading rays")
     supervision, metadata = _supervision(rays, options, probes, align, reporter)
     volume = volume or (None if output is None else output.with_suffix(".vol"))
-    environment = make_geometry(options, supervision.rays, supervision.views, volume, ns, options.voxel_size, reporter)
+    environment = make_geometry(options, supervision.rays, supervision.views, volume, options.voxel_size, reporter)
     environment = replace(environment, align=align)
     check_geometry(environment, supervision.rays, _environment_option(options), options.force, reporter)
     metadata |= environment.metadata

@@ -10,6 +10,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from nerg_mi.alignment.check import read_similarity
+from nerg_mi.environment.kinds import KINDS, detect_kind
 from nerg_mi.errors import MissingFile, NergError, parameter
 from nerg_mi.files.atomic import write_text
 from nerg_mi.formats.checkpoint import read_metadata
@@ -27,7 +28,7 @@ from .base import select_backend
 from .scene import write_scene
 from .scene_cameras import check_point
 from .scene_commands import SceneOptions, ViewOptions
-from .scene_environments import KINDS, detect_kind, find_training_scene
+from .scene_environments import find_training_scene
 
 RAYS = 2_000_000
 """Maximum number of rays that are shown; larger datasets are subsampled uniformly."""

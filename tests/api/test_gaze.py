@@ -11,12 +11,7 @@ import pytest
 import nerg_mi as nerg
 from nerg_mi.api import gaze as gaze_api
 from nerg_mi.api.gaze import TrainedGazeField
-from nerg_mi.environment.environment import (
-    identify_file,
-    load_field_geometry,
-    load_scene_geometry,
-    load_volume_geometry,
-)
+from nerg_mi.environment.environment import Environment, identify_file
 from nerg_mi.evaluation.gaze import FieldDensity
 from nerg_mi.formats.fields import save_gaze
 from nerg_mi.formats.surfaces import write_volume
@@ -108,14 +103,13 @@ def test04_the_alignment_is_applied(folder):
 
 def test05_every_kind_of_geometry(folder):
     """A file, and the same in memory, equal the evaluation."""
-    import drjit.llvm.ad as ns
 
     gaze, (o, d) = nerg.load_gaze(folder / "unknown.safetensors"), some_rays(6)
     for name, load in (
-        ("room.xml", load_scene_geometry),
-        ("block.ply", load_scene_geometry),
-        ("field.safetensors", lambda path: load_field_geometry(path, ns)),
-        ("hits.vol", load_volume_geometry),
+        ("room.xml", Environment.open),
+        ("block.ply", Environment.open),
+        ("field.safetensors", Environment.open),
+        ("hits.vol", Environment.open),
     ):
         expected = FieldDensity(gaze.network, load(folder / name).medium)
         result = gaze.density(o, d, geometry=str(folder / name), tolerance=5e-3)
@@ -156,8 +150,8 @@ def test08_other_objects_are_no_geometry(folder):
     gaze, (o, d) = nerg.load_gaze(folder / "gaze.safetensors"), some_rays(2)
     for geometry, message in (
         (3, "must be an environment in memory or a file, .*, got int"),
-        (gaze, "contains a gaze field; give a scene, a mesh"),
-        (folder / "gaze.safetensors", "contains a gaze field; give a scene, a mesh"),
+        (gaze, "contains a gaze field and is no environment"),
+        (folder / "gaze.safetensors", "contains a gaze field and is no environment"),
         (folder / "nowhere.ply", '"geometry" does not exist'),
     ):
         with pytest.raises(nerg.NergError, match=message):

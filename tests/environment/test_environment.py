@@ -5,18 +5,11 @@ from __future__ import annotations
 import struct
 from dataclasses import replace
 
-import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.environment.environment import (
-    Environment,
-    load_field_geometry,
-    load_scene_geometry,
-    load_volume_geometry,
-    make_hit_geometry,
-    no_geometry,
-)
+from nerg_mi.environment.contents import DensityGrid
+from nerg_mi.environment.environment import Environment, make_hit_geometry, no_geometry
 from nerg_mi.environment.hits import (
     DEFAULT_VOXEL,
     PADDING_VOXELS,
@@ -26,8 +19,12 @@ from nerg_mi.environment.hits import (
     shade_hits,
     voxelise_hits,
 )
+from nerg_mi.environment.trained import TrainedField
 from nerg_mi.errors import NergError
+from nerg_mi.fields.mlp import namespace
+from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.fields.splats import Splats, concatenate_splats
+from nerg_mi.formats.fields import save_radiance
 from nerg_mi.formats.splats import write_ply_splats
 from nerg_mi.formats.surfaces import write_volume
 from nerg_mi.maths.geometry import Box, Similarity
@@ -38,6 +35,7 @@ from nerg_mi.transport.volume_medium import VolumeMedium
 from tests.formats.splats.writers import random_splats
 from tests.refusals import mentions
 from tests.train.gaze.looks import looking_at
+from tests.train.radiance.ball import BOX, TINY
 
 # ---- Geometries of distant hit points: an office with windows, in closed form ----
 
@@ -253,7 +251,7 @@ def volume(tmp_path):
 
 def test_a_complete_volume_is_read(rgb, volume):
     # Mitsuba returns the box through a transform in single precision.
-    assert np.allclose(load_volume_geometry(volume).box.upper, (1, 2, 3), rtol=1e-6)
+    assert np.allclose(Environment.open(volume).box.upper, (1, 2, 3), rtol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -275,14 +273,14 @@ def test_inconsistent_headers_are_refused(rgb, volume, at, value):
     data = volume.read_bytes()
     volume.write_bytes(data[:at] + value + data[at + len(value) :])
     with pytest.raises(NergError, match="place.vol"):
-        load_volume_geometry(volume)
+        Environment.open(volume)
 
 
 @pytest.mark.parametrize("size", [0, 10, 30, 48, 100])
 def test_truncated_volumes_are_refused(rgb, volume, size):
     volume.write_bytes(volume.read_bytes()[:size])
     with pytest.raises(NergError, match="place.vol"):
-        load_volume_geometry(volume)
+        Environment.open(volume)
 
 
 def test_frames_of_rays_and_geometry():
@@ -305,7 +303,7 @@ def test_a_scene_box_holds_field_and_shapes_with_a_margin(rgb, tmp_path):
       <integrator type="nerg"><volume name="density" type="constvolume"><float name="value" value="1"/>
       </volume></integrator>
       <shape type="cube"><transform name="to_world"><translate x="-2" y="-2" z="-3"/></transform></shape></scene>""")
-    box = load_scene_geometry(tmp_path / "both.xml").box
+    box = Environment.open(tmp_path / "both.xml").box
     np.testing.assert_allclose([box.lower, box.upper], [[-3.05, -3.05, -4.05], [1.05, 1.05, 1.05]], atol=1e-6)
 
 
@@ -314,31 +312,72 @@ def test_a_mesh_is_loaded_as_a_scene(rgb, tmp_path, name):
     rgb.load_dict({"type": "cube"}).write_ply(str(tmp_path / "a.ply"))
     corners, faces = "-1 -1 -1|1 -1 -1|1 1 -1|-1 1 1".split("|"), ("1 2 3", "1 3 4")
     (tmp_path / "a.obj").write_text("".join(f"v {c}\n" for c in corners) + "".join(f"f {f}\n" for f in faces))
-    place = load_scene_geometry(tmp_path / name)
+    place = Environment.open(tmp_path / name)
     np.testing.assert_allclose([place.box.lower, place.box.upper], [[-1.02] * 3, [1.02] * 3], atol=1e-6)
     assert place.kind == "scene" and place.metadata["scene_file"]["file"] == name
     assert list_scene_files(tmp_path / name) == [tmp_path / name]
 
 
-def test_splats_are_refused_as_a_scene(rgb, tmp_path):
-    write_ply_splats(tmp_path / "a.ply", random_splats(10))
-    with pytest.raises(NergError, check=mentions("field")):
-        load_scene_geometry(tmp_path / "a.ply")
-
-
 def test_an_empty_scene_is_refused(rgb, tmp_path):
     (tmp_path / "empty.xml").write_text('<scene version="3.0.0"/>')
     with pytest.raises(NergError, match="no shapes and no field"):
-        load_scene_geometry(tmp_path / "empty.xml")
+        Environment.open(tmp_path / "empty.xml")
 
 
 def test_splat_geometry_excludes_outliers(tmp_path):
     splats = random_splats(1000, degree=0, size=0.02)
     far = Splats([[90, 0, 0]], [[1, 1, 1]], [[1, 0, 0, 0]], [0.5], np.zeros((1, 1, 3)))
     write_ply_splats(tmp_path / "a.ply", concatenate_splats([splats, far]))
-    place = load_field_geometry(tmp_path / "a.ply", ns)
+    place = Environment.open(tmp_path / "a.ply")
     assert place.kind == "field" and place.radiance is None and place.metadata["field_file"]["file"] == "a.ply"
     assert np.allclose(place.box.upper, 1, atol=0.15) and np.allclose(place.box.lower, -1, atol=0.15)
     origin, along = np.float32([[0, 0, -3]]), np.float32([[0, 0, 1]])
     # The same geometry as in rendering.
     assert 1.9 < trace_depth(place.medium, origin, along)[0][0] < 4.1
+
+
+def test_objects_are_opened_like_their_files(rgb, tmp_path):
+    """The same rays hit the same surfaces, whether an environment is in memory or in a file."""
+    import trimesh
+
+    box = trimesh.creation.box((2, 2, 2))
+    box.export(tmp_path / "box.ply")
+    splats = random_splats(20, seed=3)
+    write_ply_splats(tmp_path / "splats.ply", splats)
+    field = RadianceField.random(TINY, BOX, namespace("llvm_ad_rgb"), 0, march_step=1 / 16)
+    save_radiance(field, tmp_path / "field.safetensors", {})
+    density = np.full((2, 2, 2), 8.0)
+    write_volume(tmp_path / "grid.vol", density, (-1, -1, -1), (1, 1, 1))
+    cube = {"type": "cube"}
+    (tmp_path / "cube.xml").write_text('<scene version="3.0.0"><shape type="cube"/></scene>')
+    in_scene = {"type": "scene", "a": cube}
+    pairs = [
+        *((shape, "cube.xml") for shape in (box, cube, in_scene, [cube], {"a": cube}, rgb.load_dict(in_scene))),
+        (str(tmp_path / "box.ply"), "cube.xml"),
+        (splats, "splats.ply"),
+        *((value, "field.safetensors") for value in (field, TrainedField(field))),
+        (DensityGrid(density, (-1, -1, -1), (1, 1, 1)), "grid.vol"),
+    ]
+    rng = np.random.default_rng(0)
+    origins = rng.normal(size=(50, 3)).astype(np.float32)
+    origins *= 3 / np.linalg.norm(origins, axis=1, keepdims=True)
+    directions = (rng.uniform(-0.5, 0.5, (50, 3)) - origins).astype(np.float32)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    for value, file in pairs:
+        opened, loaded = Environment.open(value), Environment.open(tmp_path / file)
+        for ours, theirs in zip(*(trace_depth(e.medium, origins, directions) for e in (opened, loaded))):
+            np.testing.assert_allclose(ours, theirs, atol=2e-5 if file != "grid.vol" else 0.02, err_msg=file)
+        np.testing.assert_allclose(opened.box.lower, loaded.box.lower, atol=1e-6)
+        assert Environment.open(opened) is opened
+
+
+@pytest.mark.parametrize("value", [None, 3, Rays, {"type": "scene"}])
+def test_what_is_no_environment_is_refused(value):
+    with pytest.raises(NergError):
+        Environment.open(value)
+
+
+def test_files_of_rays_and_gaze_are_no_environment(tmp_path):
+    looking_at(np.zeros(3), 5).save(tmp_path / "rays.npz")
+    with pytest.raises(NergError, match="contains rays"):
+        Environment.open(tmp_path / "rays.npz")

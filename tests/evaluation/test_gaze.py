@@ -5,11 +5,10 @@ from __future__ import annotations
 import itertools
 from dataclasses import replace
 
-import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.environment.environment import load_field_geometry, load_scene_geometry
+from nerg_mi.environment.environment import Environment
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation import gaze, metrics
 from nerg_mi.evaluation.baselines import make_prior_baseline, make_uniform_baseline
@@ -372,8 +371,8 @@ def places(tmp_path_factory):
     fields.radiance(folder / "field.safetensors", density_scale=30.0)
     volume = {"type": "nerf", "filename": str(folder / "field.safetensors")}
     return {
-        "shapes": (load_scene_geometry(folder / "room.xml").medium, {}, shapes),
-        "field": (load_field_geometry(folder / "field.safetensors", ns).medium, {"field": volume}, {}),
+        "shapes": (Environment.open(folder / "room.xml").medium, {}, shapes),
+        "field": (Environment.open(folder / "field.safetensors").medium, {"field": volume}, {}),
     }
 
 

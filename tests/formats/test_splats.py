@@ -11,7 +11,8 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.environment.environment import load_field_geometry
+from nerg_mi.environment.environment import Environment
+from nerg_mi.environment.kinds import detect_kind
 from nerg_mi.errors import MissingFile, NergError
 from nerg_mi.fields.splats import Splats
 from nerg_mi.formats import ply as ply_tables
@@ -35,7 +36,6 @@ from nerg_mi.maths.sphere import SH_C0
 from nerg_mi.transport.field_medium import FieldMedium
 from nerg_mi.transport.geometry import trace_depth
 from nerg_mi.transport.splat_medium import SplatArrays, SplatMedium
-from nerg_mi.workflows.scene_environments import detect_kind
 from tests.conftest import ROOT
 from tests.formats.splats.writers import (
     random_splats,
@@ -104,7 +104,7 @@ def test_unsupported_formats_name_converter(tmp_path):
 
 def test_unsupported_splats_are_refused_by_all_commands(tmp_path):
     (tmp_path / "a.ksplat").write_bytes(b"PK")
-    for commands in (refuse_unsupported_splats, detect_kind, lambda path: load_field_geometry(path, None)):
+    for commands in (refuse_unsupported_splats, detect_kind, Environment.open):
         with pytest.raises(NergError, match=r'splat-transform "a\.ksplat" out\.ply'):
             commands(tmp_path / "a.ksplat")
     refuse_unsupported_splats(tmp_path / "a.obj")

@@ -308,16 +308,16 @@ def test_spp_option_is_bounded(tmp_path):
 
 
 def test_other_entry_points_are_checked(standins, tmp_path):
-    from nerg_mi.environment.environment import load_scene_geometry
+    from nerg_mi.environment.environment import Environment
     from nerg_mi.evaluation import study_subject
     from nerg_mi.workflows.demo import make_demo
     from nerg_mi.workflows.scene_commands import DemoOptions
 
     (tmp_path / "s.xml").write_text(scene(DEEP))
     with pytest.raises(NergError, match="deep"):
-        load_scene_geometry(tmp_path / "s.xml")
+        Environment.open(tmp_path / "s.xml")
     with pytest.raises(NergError, match="there is no scene file"):
-        load_scene_geometry(tmp_path / "missing.xml")
+        Environment.open(tmp_path / "missing.xml")
     with pytest.raises(NergError, match="deep"):
         study_subject.load_subject(tmp_path / "s.xml", 8, 8, {})
     with pytest.raises(NergError, match="deep"):

@@ -8,7 +8,7 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.environment.environment import load_field_geometry
+from nerg_mi.environment.environment import Environment
 from nerg_mi.fields.gaze_base import make_prior_table, table_directions
 from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
 from nerg_mi.maths.geometry import Box, Similarity
@@ -133,7 +133,7 @@ def test_densities_move_turn_and_scale_with_the_scene(rgb):
 @pytest.mark.parametrize("semantic", ["snapshot", "accumulated"])
 def test_semantic_features_are_those_of_each_observer(rgb, tmp_path, semantic):
     fields.radiance(tmp_path / "field.safetensors", density_scale=30.0)
-    geometry = SceneGeometry(load_field_geometry(tmp_path / "field.safetensors", ns).medium)
+    geometry = SceneGeometry(Environment.open(tmp_path / "field.safetensors").medium)
     instance, (o, d) = GazeFieldInstance(made("linear", BOX, semantic=semantic)), rays(12)
     result = evaluate_densities(instance, geometry, SETTINGS, o, d)
     np.testing.assert_allclose(result, one_by_one(rgb, instance, geometry, SETTINGS, o, d), rtol=1e-4)

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from nerg_mi.environment.environment import load_volume_geometry
+from nerg_mi.environment.environment import Environment
 from nerg_mi.errors import NergError
 from nerg_mi.fields import gaze_hits
 from nerg_mi.fields.encoding import HashGridConfig
@@ -59,7 +59,7 @@ def speckled(tmp_path_factory):
     density[8:16, 12:20, 12:20] = 0
     path = tmp_path_factory.mktemp("place") / "hits.vol"
     write_volume(path, density, BOX.lower, BOX.upper)
-    return load_volume_geometry(path).medium
+    return Environment.open(path).medium
 
 
 @pytest.mark.parametrize("escaped", ["constant", "nearest"])

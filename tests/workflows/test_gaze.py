@@ -144,7 +144,7 @@ def test_the_next_look_is_fitted_and_scored(tmp_path, rgb, monkeypatch):
     assert NextLook.from_json(written["model"]).weights == pytest.approx(result.model.weights)
     assert written["rows"][0]["bits"] == result.rows[0]["bits"] and result.rows[0]["looks"] <= 64
     # Looks without hit points end at the surfaces of the geometry.
-    place = load_training_geometry(gaze, provenance, BOX, ns)
+    place = load_training_geometry(gaze, provenance, BOX)
     distance = make_ray_distance(place)
     assert distance is not None and rays.hit is not None
     recorded = np.linalg.norm(rays.hit - rays.origin, axis=1)
@@ -396,7 +396,7 @@ def made(folder, kind, rays):
         "hits": GeometryOptions(geometry="hits"),
         "none": GeometryOptions(geometry="none"),
     }[kind]
-    return make_geometry(options, rays, (), folder / "place.vol", ns, voxel=0.2)
+    return make_geometry(options, rays, (), folder / "place.vol", voxel=0.2)
 
 
 @pytest.mark.parametrize("kind", ["field", "scene", "hits", "none"])
@@ -405,7 +405,7 @@ def test_geometry_is_located_next_to_its_checkpoint(rays, tmp_path, kind):
     assert place.kind == kind and (place.radiance is not None) == (kind == "field")
     matrix = np.diag([2.0, 2, 2, 1])
     provenance = json.loads(json.dumps(place.metadata)) | {"align": matrix.tolist()}
-    again = load_training_geometry(tmp_path / "gaze.safetensors", provenance, BOX, ns)
+    again = load_training_geometry(tmp_path / "gaze.safetensors", provenance, BOX)
     assert again.kind == kind and again.align.scale == pytest.approx(2)
     assert again.box == (BOX if kind == "none" else place.box)
     if kind == "none":
@@ -413,10 +413,10 @@ def test_geometry_is_located_next_to_its_checkpoint(rays, tmp_path, kind):
     option = {"field": "field", "scene": "scene", "hits": "geometry"}[kind]
     elsewhere = {"choice" if kind == "hits" else kind: tmp_path / "other"}
     with pytest.raises(NergError, match=f"does not exist; name it with {option}"):
-        load_training_geometry(tmp_path / "gaze.safetensors", provenance, BOX, ns, **elsewhere)
+        load_training_geometry(tmp_path / "gaze.safetensors", provenance, BOX, **elsewhere)
     (tmp_path / "other").write_bytes(b"something else")
     with pytest.raises(NergError, match=f"is not the file .*{option}"):
-        load_training_geometry(tmp_path / "gaze.safetensors", provenance, BOX, ns, **elsewhere)
+        load_training_geometry(tmp_path / "gaze.safetensors", provenance, BOX, **elsewhere)
 
 
 @pytest.mark.parametrize("kind", ["scene", "hits", "none"])
@@ -424,11 +424,11 @@ def test_geometry_is_located_next_to_its_checkpoint(rays, tmp_path, kind):
 def test_an_evaluation_takes_the_words_of_its_training(rays, tmp_path, kind, word):
     gaze, provenance = tmp_path / "gaze.safetensors", json.loads(json.dumps(made(tmp_path, kind, rays).metadata))
     if word == kind:
-        again = load_training_geometry(gaze, provenance, BOX, ns, choice=word)
+        again = load_training_geometry(gaze, provenance, BOX, choice=word)
         assert again.kind == kind
     else:
         with pytest.raises(NergError, check=mentions("geometry")) as refusal:
-            load_training_geometry(gaze, provenance, BOX, ns, choice=word)
+            load_training_geometry(gaze, provenance, BOX, choice=word)
         trained = {"scene": "scene", "hits": 'geometry="hits"', "none": 'geometry="none"'}[kind]
         assert f'"{word}"' in str(refusal.value) and trained in str(refusal.value)
         assert "does not exist" not in str(refusal.value)
@@ -436,17 +436,17 @@ def test_an_evaluation_takes_the_words_of_its_training(rays, tmp_path, kind, wor
 
 def test_a_checkpoint_without_stored_geometry_is_refused():
     with pytest.raises(NergError, match="does not store the geometry that it was trained"):
-        load_training_geometry(Path("gaze.safetensors"), {}, BOX, ns)
+        load_training_geometry(Path("gaze.safetensors"), {}, BOX)
 
 
 def test_without_geometry_the_box_contains_all_observers(rays):
     views = around(5)
     for samples, seen in ((rays, ()), (None, views), (rays, views)):
-        place = make_geometry(GeometryOptions(geometry="none"), samples, seen, None, ns)
+        place = make_geometry(GeometryOptions(geometry="none"), samples, seen, None)
         positions = np.concatenate(([samples.origin] if samples else []) + [v.camera.center[None] for v in seen])
         np.testing.assert_allclose(place.box.lower, positions.min(axis=0) - 2)
     with pytest.raises(NergError, match="a geometry of hit points needs rays, and is"):
-        make_geometry(GeometryOptions(geometry="hits"), None, views, None, ns)
+        make_geometry(GeometryOptions(geometry="hits"), None, views, None)
 
 
 def test_an_alignment_file_contains_a_similarity(tmp_path):

@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from nerg_mi.environment.environment import load_field_geometry
+from nerg_mi.environment.environment import Environment
 from nerg_mi.environment.trained import TrainedField, load_field
 from nerg_mi.errors import NergError
 from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid
@@ -482,7 +482,7 @@ def test_an_empty_field_is_refused_by_name(empty_field, tmp_path):
         lambda: compile_field(path),
         lambda: export_mesh(path, tmp_path / "a.ply"),
         lambda: export_splats(field, tmp_path / "a.ply"),
-        lambda: load_field_geometry(path, ns),
+        lambda: Environment.open(path),
     ):
         with pytest.raises(NergError, match="empty.*train it longer"):
             use()

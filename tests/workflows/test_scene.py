@@ -191,7 +191,7 @@ def test_an_unbounded_field_is_shown(rgb, tmp_path):
 
 
 def test_gaze_alone_locates_its_geometry_by_name_and_checksum(rgb, folder, tmp_path):
-    place = make_geometry(GeometryOptions(field=folder / "field.safetensors"), None, (), None, _ns())
+    place = make_geometry(GeometryOptions(field=folder / "field.safetensors"), None, (), None)
     gaze = trained(folder, "of_field.safetensors", place.metadata)
     result = write_scene([gaze], tmp_path / "a.xml", SceneOptions(observer=(0, 0, 0), mode=MODE))
     _, image = shown(result.path)
@@ -214,7 +214,7 @@ def _ns():
 
 
 def test_hit_points_become_coloured_geometry(rgb, folder, tmp_path):
-    place = make_geometry(GeometryOptions(geometry="hits"), rays(), (), folder / "hits.vol", _ns(), 0.1)
+    place = make_geometry(GeometryOptions(geometry="hits"), rays(), (), folder / "hits.vol", 0.1)
     gaze = trained(folder, "of_hits.safetensors", {**place.metadata, "rays_file": {}})
     result = write_scene([gaze, folder / "rays.npz"], tmp_path / "a.xml", SceneOptions(mode=MODE))
     assert [path.name for path in result.files] == ["a.xml", "a.color.vol"]
@@ -305,7 +305,7 @@ def test_a_walk_writes_frames(rgb, folder, tmp_path):
     [
         ([], {}, "a scene needs a field"),
         (["nowhere.ply"], {}, "there is no file"),
-        (["room.xml", "mesh.ply"], {}, "are both a place"),
+        (["room.xml", "mesh.ply"], {}, "have the same role"),
         (["rays.npz"], {"geometry": "hit"}, 'geometry.*"hits".*"none"'),
         (["mesh.ply"], {"geometry": "hits"}, "geometry"),
         (["mesh.ply"], {"person": "Ada"}, "person needs one of time and time_range,"),

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.environment.environment import identify_file
+from nerg_mi.environment.kinds import detect_kind
 from nerg_mi.errors import NergError
 from nerg_mi.figures.overview import PinholeFrame, SeenSurfaces
 from nerg_mi.files.atomic import file_sha256
@@ -35,7 +36,6 @@ from nerg_mi.workflows.scene_environments import (
     InputFiles,
     PhotoCamera,
     colors_path,
-    detect_kind,
     load_photo_camera,
     load_photo_cameras,
     recognise,

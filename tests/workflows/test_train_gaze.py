@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.cli import main
-from nerg_mi.environment.environment import Environment, load_scene_geometry
+from nerg_mi.environment.environment import Environment
 from nerg_mi.errors import NergError
 from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.gaze_log_density import LogGazeConfig
@@ -158,7 +158,7 @@ def test_recipes_in_a_scene_of_shapes(rays, tmp_path, recipe):
         "activation": {"default": "log", "small": "softplus", "paper": "linear"}[recipe],
         "normalized": recipe == "default",
     }
-    place = load_scene_geometry(tmp_path / "scene.xml")
+    place = Environment.open(tmp_path / "scene.xml")
     o, d = np.array([[-0.5, 0.2, 1.6]]), np.array([[[1.0, 0, 0], [0.8, 0.6, 0], [-1.0, 0, 0]]])
     distance, escaped = compute_surface_distances(place, o, d)
     np.testing.assert_allclose(distance[0, :2], [2.0, 2.5], rtol=1e-5)

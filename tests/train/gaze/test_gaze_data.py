@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.environment.environment import DEFAULT_DEPTH as NOWHERE_FAR
-from nerg_mi.environment.environment import Environment, load_field_geometry
+from nerg_mi.environment.environment import Environment
 from nerg_mi.errors import NergError
 from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.gaze_base import interpolate_table, table_directions
@@ -374,7 +374,7 @@ def test_features_of_training_are_those_of_rendering(rgb, radiance, tmp_path, mo
     direction = picture[:, 1:4] - eye
     distance = np.linalg.norm(direction, axis=1)
     trained = compute_semantic_features(
-        load_field_geometry(tmp_path / "field.safetensors", namespace("llvm")),
+        Environment.open(tmp_path / "field.safetensors"),
         np.broadcast_to(eye, direction.shape)[hits],
         (direction / distance[:, None])[hits],
         distance[hits],
