@@ -53,6 +53,7 @@ def main(argv=None) -> None:
     from nerg_mi.scenes import store
     from nerg_mi.scenes.store.attention_law import AttentionLaw
     from nerg_mi.train.gaze_data import find_hit_points
+    from nerg_mi.train.radiance_settings import use_current_names
 
     local = Path(store.__file__).resolve().parent
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -84,7 +85,7 @@ def main(argv=None) -> None:
 
     ns = namespace("llvm_ad_rgb")
     gaze, meta = load_gaze(args.gaze, ns)
-    metadata = meta["provenance"]
+    metadata = use_current_names(meta["provenance"])
     if "test" not in metadata:
         raise SystemExit(f'"{args.gaze}" was trained without held-out positions; train it with --test-zones 8')
     rays, law = Rays.load(args.rays), AttentionLaw()
@@ -100,8 +101,8 @@ def main(argv=None) -> None:
     methods = {"gaze field": FieldDensity(gaze, geometry.medium, depth_kind=probe_settings["depth"])}
     tuned = make_tuned_baselines(train, radius, find_hit_points(train, geometry), participants=False)
     methods |= {name: baseline.density for name, baseline in tuned.items()}
-    methods[f"law, seen by {probe_settings['cap']:,} rays, kappa {narrow:g}"] = fresh_draws(
-        law, probe_settings["cap"], narrow
+    methods[f"law, seen by {probe_settings['max_rays']:,} rays, kappa {narrow:g}"] = fresh_draws(
+        law, probe_settings["max_rays"], narrow
     )
     rows = []
     for name, method in methods.items():

@@ -107,18 +107,17 @@ def expose_settings(
 
     def decorate(kind: Class) -> Class:
         for setting in (f for settings in kinds for f in fields(settings) if "help" in f.metadata):
-            metadata, name, hint = setting.metadata, setting.metadata["option"] or setting.name, str(setting.type)
+            name, hint = setting.name, str(setting.type)
             if name in kind.__annotations__ or name in without:
                 continue
-            names, value = metadata["names"], setting.default
+            names, value = (), setting.default
             if default:
                 value, hint = None, f"{hint.removesuffix(' | None')} | None"
                 if "bool" in hint:
-                    flag = (names[-1] if names else f"--{name.replace('_', '-')}").removeprefix("--")
-                    names = (f"--{flag}/--no-{flag}",)
+                    names = ("--{0}/--no-{0}".format(name.replace("_", "-")),)
             kind.__annotations__[name] = hint
-            help = f"{metadata['help']}  {default}".rstrip()
-            exposed = option(value, help, *names, within=metadata[RANGE], group=group)
+            help = f"{setting.metadata['help']}  {default}".rstrip()
+            exposed = option(value, help, *names, within=setting.metadata[RANGE], group=group)
             setattr(kind, name, field(default=value, metadata={**exposed.metadata, _EXPOSED: True}))
         return kind
 
@@ -127,8 +126,7 @@ def expose_settings(
 
 def explicit_settings(options: Any, kind: type) -> dict[str, Any]:
     """Return keywords of the settings ``kind`` for its exposed fields that are set in ``options``."""
-    exposed = {f.name: f.metadata["option"] or f.name for f in fields(kind) if "help" in f.metadata}
-    values = {name: getattr(options, option) for name, option in exposed.items()}
+    values = {f.name: getattr(options, f.name) for f in fields(kind) if "help" in f.metadata}
     return {name: value for name, value in values.items() if value is not None}
 
 

@@ -135,7 +135,7 @@ def range_field(default: Any, allowed: Range) -> Any:
     return dataclasses.field(default=default, metadata={RANGE: allowed})
 
 
-def setting(default: Any, help: str, *names: str, allowed: Range | None = None, option: str = "") -> Any:
+def setting(default: Any, help: str, allowed: Range | None = None) -> Any:
     """Declare a field of a settings dataclass (a `ValidatedDataclass`) that is also a command-line option.
 
     Parameters
@@ -144,14 +144,10 @@ def setting(default: Any, help: str, *names: str, allowed: Range | None = None, 
         Default value.
     help
         One-line description of the value.
-    names
-        Spellings on the command line, if they differ from ``--`` and the option's name.
     allowed
         Range of the number.
-    option
-        Name of the option, if it differs from the field's name.
     """
-    return dataclasses.field(default=default, metadata={RANGE: allowed, "help": help, "names": names, "option": option})
+    return dataclasses.field(default=default, metadata={RANGE: allowed, "help": help})
 
 
 Function = TypeVar("Function", bound=Callable[..., Any])

@@ -133,9 +133,9 @@ def gaze_steps() -> Callable[[int], None]:
 
     rays = tiny.simulate_gaze()
     place = no_geometry(rays.origin)
-    probes = ProbeSettings(radius=0.5, count=16, cap=64, min_rays=8, kappa=20.0, directions=64)
+    probes = ProbeSettings(radius=0.5, probes=16, max_rays=64, min_rays=8, kappa=20.0, directions=64)
     config = GazeConfig(grid=HashGridConfig(levels=2, log2_rows=10, base=4, finest=8), width=16, geometry=4)
-    settings = GazeSettings(steps=20_000, probes=4, directions=32, zones=0)
+    settings = GazeSettings(steps=20_000, probes=4, directions=32, validation_zones=0)
     trainer = ProductTrainer(make_targets_from_rays(rays, place, probes), place.box, config, settings, ns)
 
     def step(k: int) -> None:

@@ -77,8 +77,7 @@ def make_command(row: Row) -> Command:
 
 def _repeat(setting: Field[Any]) -> Any:
     """Return the option of a field of settings."""
-    names = setting.metadata["names"]
-    return option(setting.default, setting.metadata["help"], *names, within=setting.metadata[RANGE], group=TRAINING)
+    return option(setting.default, setting.metadata["help"], within=setting.metadata[RANGE], group=TRAINING)
 
 
 def read_signature(path: str) -> Callable[..., Any]:

@@ -30,12 +30,10 @@ _VELOCITY = Range(0, 10**6)
 class EventRules(ValidatedDataclass):
     """Limits between the kinds of events. Raises `NergError` for values out of range."""
 
-    velocity: float = setting(
+    velocity_threshold: float = setting(
         100.0,
         "Velocity of gaze in the world, in degrees per second, above which it is a saccade or visual scanning.",
-        "--velocity-threshold",
         allowed=_VELOCITY,
-        option="velocity_threshold",
     )
     eye_velocity: float = setting(
         30.0,
@@ -73,4 +71,9 @@ class EventRules(ValidatedDataclass):
                 "min_fixation": self.min_fixation,
                 "max_step": self.max_step,
             }
-        return {"algorithm": "velocities of gaze and head (I-VT), kinds " + " and ".join(FIXATIONS), **asdict(self)}
+        limits = asdict(self)
+        return {
+            "algorithm": "velocities of gaze and head (I-VT), kinds " + " and ".join(FIXATIONS),
+            "velocity": limits.pop("velocity_threshold"),
+            **limits,
+        }

@@ -328,8 +328,8 @@ def angles_about(direction: np.ndarray, ahead: np.ndarray) -> np.ndarray:
 def detect_events(rays: Rays, rules: EventRules | None = None) -> Events:
     """Divide the samples of each participant into events by the velocities of gaze and head.
 
-    Steps between samples are fast or slow, by ``rules.velocity``. A run of fast steps, and slow ones between them for
-    up to ``rules.merge_gap``, is a saccade or visual scanning.
+    Steps between samples are fast or slow, by ``rules.velocity_threshold``. A run of fast steps, and slow ones between
+    them for up to ``rules.merge_gap``, is a saccade or visual scanning.
     A run of slow steps is a fixation or pursuit, if it lasts ``rules.min_fixation``: a pursuit if gaze drifts steadily
     away both from its mean direction and, where hit points are known, from their mean, which is fixed also for somebody
     who walks past. Shorter slow runs are no event. A pause longer than a minute separates recordings.
@@ -339,7 +339,7 @@ def detect_events(rays: Rays, rules: EventRules | None = None) -> Events:
     v = measure_velocities(rays)
     with np.errstate(invalid="ignore"):
         is_joined = (v.step > 0) & (v.step <= rules.max_step)
-        is_fast = is_joined & (v.gaze > rules.velocity)
+        is_fast = is_joined & (v.gaze > rules.velocity_threshold)
         is_pause = (v.step > rules.max_step) & (v.step <= MAX_PAUSE)
         is_blink = is_pause & (v.step <= rules.max_blink)
     is_fast = _fill_interruptions(is_fast, is_joined, rays.t[v.order], rules.merge_gap)

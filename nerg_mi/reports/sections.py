@@ -19,6 +19,7 @@ from nerg_mi.fields.gaze_base import read_tracking
 from nerg_mi.files.html import Html, element, figure, image, key_value_table, markup, paragraph, table
 from nerg_mi.rays.quality import WARNING_LABEL, make_quality_report
 from nerg_mi.rays.rays import TRACKING
+from nerg_mi.train.radiance_settings import use_current_names
 
 from .charts import Point, interval_chart
 from .data import MeanShare, ObjectAttention, Run
@@ -455,8 +456,9 @@ def _show_settings(run: Run) -> Html:
     if isinstance(test, dict):
         facts.append(("held out", _describe_held_out(test)))
     parts = [element("h3", "Training"), key_value_table(facts)]
+    named = use_current_names(provenance)
     for key, title in (("settings", "Training settings"), ("probes", "Probes")):
-        rows = _flatten_settings(provenance.get(key, {}))
+        rows = _flatten_settings(named.get(key, {}))
         if rows:
             parts.append(element("details", element("summary", title), key_value_table(rows)))
     architecture = _flatten_settings(run.gaze.get("architecture", {}))

@@ -307,7 +307,7 @@ class ValidationSplit:
 def split_validation(
     supervision: Supervision, geometry: Environment, settings: GazeSettings, probes: ProbeSettings
 ) -> ValidationSplit:
-    """Hold out zones of positions for validation, as many as ``settings.zones``.
+    """Hold out zones of positions for validation, as many as ``settings.validation_zones``.
 
     Training data within 2R of a validation position are removed, where R is the probe radius: rays and views, or only
     views if there are no rays.
@@ -315,10 +315,10 @@ def split_validation(
     Raises `NergError` if too little training data would remain.
     """
     rays, views = supervision.rays, supervision.views
-    if not settings.zones:
+    if not settings.validation_zones:
         return ValidationSplit(supervision)
     if rays is None:
-        train, validation = split_views(views, settings.zones, 2 * probes.radius, settings.seed + 1)
+        train, validation = split_views(views, settings.validation_zones, 2 * probes.radius, settings.seed + 1)
         return ValidationSplit(
             Supervision(None, tuple(train)),
             Supervision(None, tuple(validation)),
@@ -327,7 +327,7 @@ def split_validation(
     split = split_by_position(
         rays,
         probes.radius,
-        zones=settings.zones,
+        zones=settings.validation_zones,
         test_probes=settings.validation_probes,
         min_rays=settings.validation_min_rays or probes.min_rays,
         seed=settings.seed + 1,
@@ -756,14 +756,14 @@ def make_probes(rays: Rays, settings: ProbeSettings, queries: np.ndarray | None 
         rays,
         settings.radius,
         placement=settings.placement,
-        count=settings.count,
+        count=settings.probes,
         spacing=settings.spacing,
         queries=queries,
-        max_rays=settings.cap,
-        min_rays=min(settings.min_rays, settings.cap),
+        max_rays=settings.max_rays,
+        min_rays=min(settings.min_rays, settings.max_rays),
         kappa_rule=settings.kappa_rule,
         kappa=settings.kappa,
-        weights=settings.weights,
+        weights=settings.ray_weights,
         seed=seed,
     )
 
@@ -808,8 +808,8 @@ def make_targets_from_rays(
 ) -> GazeTargets:
     """Make targets of the probes on ``rays``, at ``queries`` (P, 3) in metres if given.
 
-    With ``settings.fresh`` the targets can ``resample`` their directions. Raises `NergError` if no probe holds enough
-    rays.
+    With ``settings.resample_directions`` the targets can ``resample`` their directions. Raises `NergError` if no
+    probe holds enough rays.
     """
     requirements = requirements or TargetRequirements()
     probes = make_probes(rays, settings, queries, seed)
@@ -817,11 +817,11 @@ def make_targets_from_rays(
         probes, geometry, settings.directions, settings.depth, requirements, seed
     )
     targets = make_with_seed(seed)
-    if settings.fresh:
+    if settings.resample_directions:
         targets = replace(targets, resample=lambda epoch: make_with_seed((seed, epoch)))
     if requirements.prior_rows:
         prior_table = make_prior_from_rays(
-            rays, requirements.prior_rows, geometry, seed, settings.weights, settings.mix_kappa
+            rays, requirements.prior_rows, geometry, seed, settings.ray_weights, settings.prior_kappa
         )
         targets = replace(targets, prior_table=prior_table)
     return targets
@@ -857,7 +857,8 @@ def make_targets_from_views(
     """Make targets of ``views`` in the frame of ``geometry``.
 
     Each view has ``settings.directions`` directions, each with the density of its pixel. The views are reduced until
-    each pixel has about four directions. With ``settings.fresh`` the targets can ``resample`` their directions.
+    each pixel has about four directions. With ``settings.resample_directions`` the targets can ``resample`` their
+    directions.
     """
     requirements, count = requirements or TargetRequirements(), settings.directions
     reduced_views = [v.reduce(max(1, count // _DIRECTIONS_PER_PIXEL)) for v in views]
@@ -875,7 +876,7 @@ def make_targets_from_views(
         return replace(targets, solid_angle=solid_angle.astype(np.float32))
 
     targets = make_with_seed(seed)
-    if settings.fresh:
+    if settings.resample_directions:
         targets = replace(targets, resample=lambda epoch: make_with_seed((seed, epoch)))
     return (
         replace(targets, prior_table=make_prior_from_views(views, requirements.prior_rows))

@@ -148,7 +148,7 @@ def train_ensemble(
     plan, selection = select_variant(supervision, geometry, plan, ns, report, _read_identity(state, parts, ns))
     if selection is not None:
         state = replace(state, identity={**state.identity, SELECTION_KEY: selection.to_dict()})
-    full_plan, plan = plan, plan.with_settings(mix_folds=0)
+    full_plan, plan = plan, plan.with_settings(prior_folds=0)
     if plan.settings.minutes is not None:
         time_fraction = 1 - FOLD_TIME_FRACTION if selects_weight else 1.0
         plan = plan.with_settings(minutes=time_fraction * plan.settings.minutes / members)

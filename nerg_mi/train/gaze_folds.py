@@ -130,7 +130,7 @@ class PriorSelection:
         table = None
         if self.prior_kappa is not None and rays is not None:
             table = make_prior_from_rays(
-                rays, field.config.prior, geometry, plan.settings.seed, plan.probes.weights, self.prior_kappa
+                rays, field.config.prior, geometry, plan.settings.seed, plan.probes.ray_weights, self.prior_kappa
             )
         # The hits are mixed into the mixture of field and prior.
         rest = 1 - self.hits_weight
@@ -147,7 +147,7 @@ class PriorSelection:
 
 def selects_prior_weight(plan: GazePlan) -> bool:
     """Return whether ``plan`` selects the prior by folds."""
-    return plan.settings.mix_folds > 0 and plan.config.prior > 0
+    return plan.settings.prior_folds > 0 and plan.config.prior > 0
 
 
 class FoldDensities(NamedTuple):
@@ -272,16 +272,16 @@ def evaluate_folds(
     if rays is None or not config.prior:
         raise ValueError("folds need rays and a field with a position-independent prior")
     if plan.settings.minutes is not None:
-        plan = plan.with_settings(minutes=FOLD_TIME_FRACTION * plan.settings.minutes / plan.settings.mix_folds)
+        plan = plan.with_settings(minutes=FOLD_TIME_FRACTION * plan.settings.minutes / plan.settings.prior_folds)
     settings, needs = plan.settings, TargetRequirements.from_config(plan.config)
-    probes, kappa = replace(plan.probes, fresh=False), plan.probes.mix_kappa
+    probes, kappa = replace(plan.probes, resample_directions=False), plan.probes.prior_kappa
     if kappa is None and not config.prior_factor:
-        kappa = select_prior_kappa(rays, probes.weights, settings.seed)
-    plan = replace(plan, probes=replace(probes, mix_kappa=kappa))
+        kappa = select_prior_kappa(rays, probes.ray_weights, settings.seed)
+    plan = replace(plan, probes=replace(probes, prior_kappa=kappa))
     box = compute_observer_bounds(geometry.points_to_field(rays.origin), geometry.box)
     if settings.reaimed_hits:
         rays = replace(rays, hit=find_hit_points(rays, geometry, probes.depth))
-    for k, (train, held_out) in enumerate(iter_folds(rays, probes.radius, settings.mix_folds, settings.seed)):
+    for k, (train, held_out) in enumerate(iter_folds(rays, probes.radius, settings.prior_folds, settings.seed)):
         try:
             targets = make_targets_from_rays(train, geometry, plan.probes, needs, seed=settings.seed)
         except NergError:
@@ -291,7 +291,7 @@ def evaluate_folds(
         with Interruption() as stop:
             while trainer.progress < 1:
                 trainer.step()
-                fraction = (k + trainer.progress) / settings.mix_folds
+                fraction = (k + trainer.progress) / settings.prior_folds
                 on_progress(GazeProgress(f"fold {k + 1}", fraction, trainer.steps, trainer.seconds, None))
                 stop.check()
         test = sample_participants_equally(held_out, _MAX_RAYS, settings.seed + 3)
@@ -539,7 +539,7 @@ def compute_fold_cost(plan: GazePlan) -> float:
     """Return the cost of all folds of all architectures of ``plan``, relative to a fit."""
     if plan.settings.minutes is not None:
         return FOLD_TIME_FRACTION / (1 - FOLD_TIME_FRACTION)
-    return plan.settings.mix_folds * (1 + len(plan.alternatives))
+    return plan.settings.prior_folds * (1 + len(plan.alternatives))
 
 
 def scale_progress(on_progress: ProgressCallback, k: int, count: int, stage: str) -> ProgressCallback:

@@ -274,9 +274,9 @@ register_recipe(
         # give the same result.
         settings={
             "steps": 160,
-            "zones": 0,
+            "validation_zones": 0,
             "loss": "likelihood",
-            "integral": 0.0,
+            "integral_weight": 0.0,
             "probes": 24,
             "directions": 512,
             "rays": 64,
@@ -286,7 +286,7 @@ register_recipe(
             "weight_decay": 1.0,
             "ema_decay": 0.95,
             "validation_min_rays": 64,
-            "mix_folds": 5,
+            "prior_folds": 5,
             "reaimed_hits": True,
         },
         # Probes are spaced evenly over the observer positions; a density proportional to the rays would follow where
@@ -295,13 +295,13 @@ register_recipe(
         probes={
             "placement": "blue",
             "spacing": 0.08,
-            "count": 1024,
+            "probes": 1024,
             "min_rays": 1,
             "kappa": 200.0,
             "directions": 2048,
-            "weights": "person",
+            "ray_weights": "person",
         },
-        views_only_settings={"steps": 200, "zones": 3, "patience": 10},
+        views_only_settings={"steps": 200, "validation_zones": 3, "patience": 10},
         supported_options=frozenset({"prior_folds", "prior_kappa", "reaimed_hits"}),
     )
 )

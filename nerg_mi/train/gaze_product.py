@@ -137,9 +137,9 @@ class ProductTrainer(GazeTrainer):
         density = self.evaluate_density(batch, self.current_parameters())
         self.loss = compute_gaze_loss(density, batch.truth, D, **LOSSES[s.loss])
         total = self.loss.total
-        if s.integral:
+        if s.integral_weight:
             # Compare with the truth in the same directions, so that a subset of directions causes no bias.
-            total += s.integral * dr.mean(dr.square(batch.integrate(density - batch.truth)))
+            total += s.integral_weight * dr.mean(dr.square(batch.integrate(density - batch.truth)))
         dr.backward(total)
 
     def evaluate_density(self, batch: GazeBatch, parameters: dict) -> Any:
@@ -151,7 +151,7 @@ class ProductTrainer(GazeTrainer):
 
     def validation_objective(self, kld: float, cc: float, mae: float, off: float) -> float:
         w = LOSSES[self.settings.loss]
-        return w["kld"] * kld + w["cc"] * (1 - cc) + w["mae"] * mae + self.settings.integral * off
+        return w["kld"] * kld + w["cc"] * (1 - cc) + w["mae"] * mae + self.settings.integral_weight * off
 
 
 # ---- The two initialisations of the paper: a trunk with the weights of the radiance field, frozen or fine-tuned ----
@@ -263,7 +263,7 @@ register_recipe(
         settings={
             "steps": 12_800,
             "loss": "paper",
-            "integral": 0.0,
+            "integral_weight": 0.0,
             "probes": 16,
             "directions": 1024,
             "learning_rate": 1e-3,
@@ -274,8 +274,8 @@ register_recipe(
         # Bandwidth and minimum number of rays are those of the authors' code.
         probes={
             "radius": 0.1,
-            "count": 4096,
-            "cap": 1024,
+            "probes": 4096,
+            "max_rays": 1024,
             "kappa_rule": "silverman",
             "directions": 1024,
             "min_rays": 8,

@@ -109,7 +109,7 @@ def train_gaze(
     Zones of positions are held out for validation, and training data within 2R of them are removed. The best weights on
     the validation data count, and the run stops early when they no longer improve. With ``refit``, a second fit uses
     all data for the best number of steps; the reported scores remain those of the first fit. With
-    ``plan.settings.mix_folds`` and rays, folds select the prior of a log density (`evaluate_folds`), and before
+    ``plan.settings.prior_folds`` and rays, folds select the prior of a log density (`evaluate_folds`), and before
     that the variant, if there are several (`select_variant`).
     """
     on_progress, state, started = on_progress or (lambda progress: None), state or StateSettings(), time.perf_counter()
@@ -175,7 +175,7 @@ def train_gaze(
         provenance["mix"] = selection.to_dict()
     if validation is not None and first.scores is not None:
         provenance["validation"] = {
-            "zones": settings.zones,
+            "zones": settings.validation_zones,
             "probes": len(validation.truth),
             "rays_held_out": split.rays_held_out,
             "views_held_out": split.views_held_out,

@@ -43,10 +43,8 @@ class ProbeSettings(ValidatedDataclass):
     """How rays become probes and probes become targets. Lengths are in metres, in the frame of the rays."""
 
     radius: float = setting(0.25, "Radius R of a probe in metres.", allowed=LENGTHS)
-    count: int = setting(2048, "Maximum number of probes.", allowed=Range(1, 10**6), option="probes")
-    cap: int = setting(
-        1024, "Maximum number of rays in a probe; the nearest are used.", allowed=Range(1, 10**6), option="max_rays"
-    )
+    probes: int = setting(2048, "Maximum number of probes.", allowed=Range(1, 10**6))
+    max_rays: int = setting(1024, "Maximum number of rays in a probe; the nearest are used.", allowed=Range(1, 10**6))
     min_rays: int = setting(64, "Minimum number of rays in a probe.", allowed=Range(1, 10**6))
     kappa_rule: str = setting(
         "fixed",
@@ -66,21 +64,16 @@ class ProbeSettings(ValidatedDataclass):
     depth: str = "median"  # Depth estimator (`transport.depth`)
     placement: str = setting("data", "Placement of probes: data (at ray origins), grid, random, or blue (blue noise).")
     spacing: float | None = range_field(None, LENGTHS)  # Distance between probes, for placements that use it
-    fresh: bool = setting(
-        False, "Draw new directions for each epoch, not once per probe.", option="resample_directions"
+    resample_directions: bool = setting(False, "Draw new directions for each epoch, not once per probe.")
+    ray_weights: str = setting(
+        "equal", "Weights of the rays in a probe: equal, distance (1 - d/R), or person (equal for each participant)."
     )
-    weights: str = setting(
-        "equal",
-        "Weights of the rays in a probe: equal, distance (1 - d/R), or person (equal for each participant).",
-        option="ray_weights",
-    )
-    mix_kappa: float | None = setting(
+    prior_kappa: float | None = setting(
         None,
         "Only for the recipe named default: concentration (unitless), or standard deviation such as 10deg, of the "
         "kernels of the position-independent prior. Default: chosen by leaving out participants, or 30 without "
         "--prior-folds.",
         allowed=KAPPAS,
-        option="prior_kappa",
     )
 
     def to_dict(self) -> dict:
@@ -103,11 +96,10 @@ class GazeSettings(RunSettings):
         "Only for the recipes small and paper: loss; paper is KLD + (1 - CC) + MAE, code is MAE + 0.1 (1 - CC).",
     )
     # KLD and CC do not depend on the integral. MAE alone pulls it to the median.
-    integral: float = setting(
+    integral_weight: float = setting(
         1.0,
         "Only for the recipes small and paper: weight of the squared error of the integral over the sphere.",
         allowed=LOSS_WEIGHTS,
-        option="integral_weight",
     )
     probes: int = range_field(16, Range(1, 10**6))  # Random probes per step
     directions: int = range_field(256, Range(1, 1 << 20))  # Random directions per probe
@@ -124,22 +116,18 @@ class GazeSettings(RunSettings):
     num_validations: int = range_field(20, Range(1, 10**6))  # Number of validations per run
     # Validations without an improvement after which the run stops; 0 disables early stopping.
     patience: int = range_field(6, Range(0, 10**6))
-    zones: int = setting(
-        3,
-        "Number of position zones held out for validation (early stopping); 0 disables it.",
-        allowed=Range(0, 1000),
-        option="validation_zones",
+    validation_zones: int = setting(
+        3, "Number of position zones held out for validation (early stopping); 0 disables it.", allowed=Range(0, 1000)
     )
     validation_probes: int = range_field(60, Range(1, 10**6))  # Validation probes in all zones
     # Minimum rays per validation probe; None: as for training probes.
     validation_min_rays: int | None = range_field(None, Range(1, 10**6))
     refit: bool = setting(True, "Train again on all rays, for the number of steps that validation found best.")
-    mix_folds: int = setting(
+    prior_folds: int = setting(
         0,
         "Only for the recipe named default: number of cross-validation folds over participants and positions that "
         "choose the weight of the position-independent prior; 0: no folds, the weight is 0.05.",
         allowed=Range(0, 1000),
-        option="prior_folds",
     )
     reaimed_hits: bool = setting(
         False,
@@ -147,7 +135,7 @@ class GazeSettings(RunSettings):
         "into the field, with a weight chosen by --prior-folds. The file then contains up to 32,768 samples without "
         "names and times.",
     )
-    frozen: bool = setting(False, "Keep the weights of --init field fixed.", option="freeze")
+    freeze: bool = setting(False, "Keep the weights of --init field fixed.")
 
     def __post_init__(self) -> None:
         super().__post_init__()

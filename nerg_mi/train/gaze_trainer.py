@@ -199,7 +199,7 @@ class GazeTrainer(Trainer, ABC):
     schedule : int, optional
         Number of steps that the learning-rate schedule spans, if it differs from the length of the run.
     initial : dict, optional
-        Initial arrays by name. With ``settings.frozen`` they are not trained.
+        Initial arrays by name. With ``settings.freeze`` they are not trained.
 
     Notes
     -----
@@ -225,7 +225,7 @@ class GazeTrainer(Trainer, ABC):
         self.initial_field: Any = self.init_field()
         if initial:
             self.initial_field.set_parameters(initial)
-        parameters, frozen = self.initial_field.parameters(), (initial or {}) if settings.frozen else {}
+        parameters, frozen = self.initial_field.parameters(), (initial or {}) if settings.freeze else {}
         trained = {k: v for k, v in self.select_trainable(parameters).items() if k not in frozen}
         self.constant = {k: v for k, v in parameters.items() if k not in trained}
         self.loss: Any = None

@@ -19,6 +19,8 @@ from nerg_mi.files.schema import Items, Number, check_json
 from nerg_mi.formats.fields import read_number
 from nerg_mi.interruption import Interrupted
 
+from .radiance_settings import use_current_names
+
 # ---- Trainer ----
 
 
@@ -197,45 +199,13 @@ def saving_on_failure(path: Path | None, save: Callable[[], None], is_done: bool
         path.unlink(missing_ok=True)
 
 
-# Settings in states of earlier versions, and their current names.
-_OLD_SETTINGS = {
-    "final_rate": "lr_final_ratio",
-    "hold": "lr_hold_fraction",
-    "average": "ema_decay",
-    "looks": "num_validations",
-    "watched": "validation_probes",
-    "watched_rays": "validation_min_rays",
-    "growth": "step_growth",
-    "reach": "damping_distance",
-    "reach_share": "damping_fraction",
-    "stop": "min_transmittance",
-    "thin_sure": "rr_weight",
-    "thin_least": "rr_min_probability",
-    "grid_every": "grid_interval",
-    "settle": "extraction_start",
-    "look_most": "max_prepass_batches",
-    "stride_share": "stride_fraction",
-    "huber": "huber_delta",
-    "final_depth": "depth_weight_final_ratio",
-    "replay": "hard_pixel_fraction",
-}
-
-
-def _use_current_names(identity: dict) -> dict:
-    """Replace old names of settings in the ``identity`` of a run by their current names."""
-    settings = identity.get("settings")
-    if not isinstance(settings, dict):
-        return identity
-    return {**identity, "settings": {_OLD_SETTINGS.get(name, name): value for name, value in settings.items()}}
-
-
 def check_same_run(path: str | Path, then: dict, now: dict) -> None:
     """Raise `NergError` unless the identities ``then`` of the stored run and ``now`` of this run agree."""
     if not isinstance(then, dict):
         raise NergError(
             f'cannot resume the run in "{path}": its state is damaged; start again without {parameter("resume", True)}'
         )
-    then, now = _use_current_names(then), json.loads(json.dumps(now))
+    then, now = use_current_names(then), json.loads(json.dumps(now))
     different = [k for k in now if then.get(k) != now[k]]
     if different:
         raise NergError(

@@ -366,7 +366,7 @@ def scanpath(files: Sequence[Path], options: ScanpathOptions, reporter: Reporter
         pixels = _visible_pixels(camera, targets, layers.values, np.ravel(np.array(sensor_center(camera))))
     hidden = int(np.isnan(pixels[:, 0]).sum())
     people, index = np.unique(fixations.person[rows], return_inverse=True)
-    threshold = f"I-VT, {rules.velocity:g}°/s" if dispersion is None else f"I-DT, {dispersion:g}°"
+    threshold = f"I-VT, {rules.velocity_threshold:g}°/s" if dispersion is None else f"I-DT, {dispersion:g}°"
     note = f"{len(rows)} fixations ({threshold}, at least {rules.min_fixation:g} s)"
     note += f"; {hidden} outside of the image or hidden" if hidden else ""
     names = tuple(rays.persons[p] for p in people)

@@ -74,7 +74,7 @@ def check_plan(options: GazeOptions, views_alone: bool = False) -> ProbeSettings
     recipe.make_gaze_settings(explicit_settings(options, GazeSettings), views_alone)
     probes = recipe.make_probe_settings(explicit_settings(options, ProbeSettings))
     if rows := TargetRequirements.from_config(config).prior_rows:
-        check_prior_kappa(rows, probes.mix_kappa)
+        check_prior_kappa(rows, probes.prior_kappa)
     return probes
 
 

@@ -127,7 +127,7 @@ def test_repeated_options_are_read_again_and_equal_names_are_not():
 # ---- A setting of gaze trainings is also an option of folds ----
 
 FIELDS = [f for kind in (ProbeSettings, TrainingSettings) for f in fields(kind) if "help" in f.metadata]
-SETTINGS = {f.metadata["option"] or f.name for f in FIELDS}
+SETTINGS = {f.name for f in FIELDS}
 CHANGED_SETTINGS = {"learning_rate": 0.5, "max_rays": 7, "placement": "grid", "resample_directions": True}
 
 

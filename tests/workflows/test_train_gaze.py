@@ -88,7 +88,7 @@ def test_a_training_returns_the_field_and_reports_progress(rays):
     assert heard.shares == sorted(heard.shares) and heard.shares[-1] == pytest.approx(1)
     # One fit, and folds that take as many steps each
     last_fit = max(share for share, text in zip(heard.shares, heard.texts) if text.startswith("fit"))
-    assert last_fit == pytest.approx(1 / (1 + provenance["settings"]["mix_folds"]))
+    assert last_fit == pytest.approx(1 / (1 + provenance["settings"]["prior_folds"]))
     assert heard.texts[0].startswith("placing probes") and "fit: step 3" in heard.texts
     assert heard.texts[-1].startswith("folds: step") and provenance["mix"]["folds"] == 1
     summaries = [m.split(";")[0].split(":")[0] for m in heard.messages]
@@ -176,8 +176,15 @@ def test_a_registered_recipe_trains_from_function_and_command(rays, tmp_path, mo
             make_config=lambda c: LogGazeConfig(grid, c.variant, width=8, **get_geometry_options(c.geometry_kind)),
             trainer=LikelihoodTrainer,
             losses=("likelihood",),
-            settings={"steps": 3, "zones": 0, "loss": "likelihood", "integral": 0.0, "probes": 4, "directions": 32},
-            probes={"radius": 0.5, "count": 6, "min_rays": 8, "directions": 64},
+            settings={
+                "steps": 3,
+                "validation_zones": 0,
+                "loss": "likelihood",
+                "integral_weight": 0.0,
+                "probes": 4,
+                "directions": 32,
+            },
+            probes={"radius": 0.5, "probes": 6, "min_rays": 8, "directions": 64},
         )
     )
     result = train_gaze(rays, options=GazeOptions(geometry="none", recipe="coarse", variant="emit", threads=1))
@@ -259,7 +266,7 @@ def test_the_command_resumes_a_training(tmp_path, monkeypatch, capsys):
     )
     code, _, said = nerg(capsys, *line, "--resume")
     provenance = load_gaze(out, ns)[1]["provenance"]
-    assert provenance["steps"] == 8 and not provenance["interrupted"] and provenance["probes"]["fresh"]
+    assert provenance["steps"] == 8 and not provenance["interrupted"] and provenance["probes"]["resample_directions"]
     assert code == 0 and "go on" not in said and not out.with_suffix(".run").exists()
 
 
@@ -352,7 +359,7 @@ def test_every_option_reaches_the_plan():
     plan = plan_gaze(GazeOptions(scene=Path("a.xml"), recipe="small", **settings, **of_field), SCENE)
     names = {}
     for part in (plan.settings, plan.probes):
-        names |= {f.metadata.get("option") or f.name: getattr(part, f.name) for f in fields(part)}
+        names |= {f.name: getattr(part, f.name) for f in fields(part)}
     # The directions of a batch and of a probe are different settings.
     assert {name: names[name] for name in settings} == settings and plan.probes.directions == 33
     c = plan.config

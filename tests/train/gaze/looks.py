@@ -24,18 +24,18 @@ BOX = Box((-2, -2, 0), (2, 2, 3))
 GRID = HashGridConfig(levels=2, log2_rows=10, base=4, finest=8)
 SMALL = GazeConfig(grid=GRID, width=16, geometry=4)
 LOG = LogGazeConfig(grid=HashGridConfig(levels=2, log2_rows=10, base=2, finest=4), width=16, prior=16, mix=0.1)
-PROBES = ProbeSettings(radius=0.5, count=16, cap=64, min_rays=8, kappa=20.0, directions=64)
+PROBES = ProbeSettings(radius=0.5, probes=16, max_rays=64, min_rays=8, kappa=20.0, directions=64)
 NOWHERE = Environment(None, BOX, "none")
-PRODUCT = GazeSettings(steps=16, num_validations=8, zones=2, validation_probes=6, probes=4, directions=32)
+PRODUCT = GazeSettings(steps=16, num_validations=8, validation_zones=2, validation_probes=6, probes=4, directions=32)
 LIKELIHOOD = GazeSettings(
     steps=16,
     num_validations=8,
-    zones=2,
+    validation_zones=2,
     validation_probes=6,
     probes=4,
     directions=32,
     loss="likelihood",
-    integral=0.0,
+    integral_weight=0.0,
     rays=16,
 )
 

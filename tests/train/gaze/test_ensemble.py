@@ -20,7 +20,7 @@ from nerg_mi.train.gaze_trainer import StateSettings
 from .looks import LIKELIHOOD, LOG, NOWHERE, PROBES, around, looking_at, planned, train
 
 PLACE = replace(LOG, geometry="none")
-SHORT = replace(LIKELIHOOD, steps=4, zones=0)
+SHORT = replace(LIKELIHOOD, steps=4, validation_zones=0)
 
 
 def crowd(people=6, n=1200, seconds=100.0):
@@ -193,7 +193,7 @@ def test_views_are_resampled_one_by_one():
     drawn = resample_views(views, (0, 1))
     assert len(drawn) == 12 and 5 <= len(set(drawn)) < 12 and set(drawn) <= set(views)
     assert drawn == resample_views(views, (0, 1)) != resample_views(views, (0, 2))
-    plan = planned(PLACE, replace(SHORT, mix_folds=3))
+    plan = planned(PLACE, replace(SHORT, prior_folds=3))
     field, provenance = train_ensemble(2, Supervision(None, views), NOWHERE, plan, ns)
     assert (
         provenance["ensemble"]["resampled"] == "views"

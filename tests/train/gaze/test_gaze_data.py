@@ -251,9 +251,9 @@ def test_kernels_too_narrow_for_the_directions_are_refused(rays, wall):
 
 def test_probes_are_placed_according_to_the_settings(rays):
     probes = make_probes(rays, PROBES, seed=3)
-    assert 1 <= len(probes) <= PROBES.count and (probes.kappa == PROBES.kappa).all()
+    assert 1 <= len(probes) <= PROBES.probes and (probes.kappa == PROBES.kappa).all()
     assert probes.radius == PROBES.radius
-    assert PROBES.min_rays <= probes.counts.min() <= probes.counts.max() <= PROBES.cap
+    assert PROBES.min_rays <= probes.counts.min() <= probes.counts.max() <= PROBES.max_rays
     at = np.array([[-0.6, 0, 1.6]])
     np.testing.assert_array_equal(make_probes(rays, PROBES, at).queries, at)
     lattice = make_probes(rays, replace(PROBES, placement="grid", spacing=0.3))
@@ -264,7 +264,7 @@ def test_prior_is_only_made_if_required(rays, wall):
     assert make_targets_from_rays(rays, wall, PROBES).prior_table is None
     wide, narrow = (
         make_targets_from_rays(
-            rays, wall, replace(PROBES, mix_kappa=kappa), TargetRequirements(prior_rows=12)
+            rays, wall, replace(PROBES, prior_kappa=kappa), TargetRequirements(prior_rows=12)
         ).prior_table
         for kappa in (10.0, 40.0)
     )
@@ -329,21 +329,21 @@ def test02_the_fast_path_is_the_field(radiance, with_own_features):
     assert np.allclose(np.array(fast), np.array(slow), rtol=1e-5) and np.ptp(np.array(slow)) > 0
 
 
-@pytest.mark.parametrize("frozen", [True, False])
-def test04_frozen_trunks_stay_and_others_move(rgb, radiance, rays, frozen):
+@pytest.mark.parametrize("freeze", [True, False])
+def test04_frozen_trunks_stay_and_others_move(rgb, radiance, rays, freeze):
     ns = namespace("llvm")
     config = gaze_config(radiance, semantic="accumulated", semantic_own=True)
     data = make_targets_from_rays(rays, place_of(radiance), PROBES, TargetRequirements(semantic="accumulated"))
     assert data.semantic.shape == (*data.truth.shape, 5)
     trainer = ProductTrainer(
-        data, BOX, config, GazeSettings(steps=30, frozen=frozen), ns, initial=extract_initial_weights(radiance, config)
+        data, BOX, config, GazeSettings(steps=30, freeze=freeze), ns, initial=extract_initial_weights(radiance, config)
     )
     before = trainer.evaluate(data).loss
     while trainer.progress < 1:
         trainer.step()
     field, start = trainer.make_field().parameters(), extract_initial_weights(radiance, config)
     for name, value in start.items():
-        assert np.array_equal(np.array(field[name]), np.array(value)) == frozen, name
+        assert np.array_equal(np.array(field[name]), np.array(value)) == freeze, name
     assert trainer.evaluate(data).loss < 0.9 * before
 
 
@@ -439,7 +439,7 @@ def test_a_quarter_of_the_views_must_remain():
 
 def test_validation_zones_use_all_rays_around_them():
     double = Environment(None, BOX, "none", align=Similarity(np.diag([2.0, 2, 2, 1])))
-    settings = GazeSettings(steps=1, zones=2, validation_probes=6)
+    settings = GazeSettings(steps=1, validation_zones=2, validation_probes=6)
     for place in (NOWHERE, double):
         observers = place.points_to_field(RAYS.origin[::60])
         views = [view(lobe, eye, (1, 0, 0), name=f"v{k}") for k, eye in enumerate(observers)]
@@ -457,7 +457,7 @@ def test_validation_zones_use_all_rays_around_them():
 
 def test_views_alone_are_split_for_validation():
     split = split_validation(
-        Supervision(None, around(80)), NOWHERE, GazeSettings(steps=1, zones=3), replace(PROBES, radius=0.15)
+        Supervision(None, around(80)), NOWHERE, GazeSettings(steps=1, validation_zones=3), replace(PROBES, radius=0.15)
     )
     assert split.training.rays is None and split.validation.rays is None and split.centres is None
     assert split.views_held_out == 80 - len(split.training.views) >= len(split.validation.views) > 0
@@ -526,7 +526,9 @@ def test_the_likelihood_is_conditioned_on_the_view():
     data = make_targets_from_views(
         around(4), NOWHERE, VIEW_TARGETS_PROBES, TargetRequirements.from_config(VIEW_TARGETS_SMALL)
     )
-    settings = GazeSettings(steps=1, loss="likelihood", integral=0.0, probes=4, directions=512, rays=2048, zones=0)
+    settings = GazeSettings(
+        steps=1, loss="likelihood", integral_weight=0.0, probes=4, directions=512, rays=2048, validation_zones=0
+    )
     trainer = LikelihoodTrainer(data, BOX, replace(VIEW_TARGETS_SMALL, mix=0.0, geometry="none"), settings, ns)
     field = trainer.initial_field
     r_o, p_o = data.directions.reshape(-1, 3), np.repeat(data.positions, 512, axis=0)
@@ -553,7 +555,7 @@ def test_the_losses_of_a_density_do_not_see_its_scale_through_views():
         data.distance,
         data.misses,
     )
-    settings = GazeSettings(steps=1, zones=0)
+    settings = GazeSettings(steps=1, validation_zones=0)
     source = lambda data, scale: ProductTrainer(data, BOX, replace(PLAIN, emit_scale=scale), settings, ns).evaluate(
         data
     )
@@ -572,13 +574,13 @@ def test_a_law_is_learnt_from_views_alone_and_holds_around():
     settings = GazeSettings(
         steps=120,
         loss="likelihood",
-        integral=0.0,
+        integral_weight=0.0,
         probes=12,
         directions=128,
         rays=64,
         learning_rate=1e-2,
         weight_decay=0.1,
-        zones=2,
+        validation_zones=2,
         ema_decay=0.9,
         num_validations=4,
     )
@@ -606,8 +608,10 @@ def test_a_law_is_learnt_from_views_alone_and_holds_around():
 
 def test_rays_and_views_train_one_field():
     both = Supervision(looking_at((1.5, 0.4, 1.2)), around(6))
-    settings = GazeSettings(steps=4, probes=4, directions=32, zones=1, validation_probes=4, num_validations=2)
-    probes = ProbeSettings(radius=0.25, count=8, cap=64, min_rays=4, directions=64)
+    settings = GazeSettings(
+        steps=4, probes=4, directions=32, validation_zones=1, validation_probes=4, num_validations=2
+    )
+    probes = ProbeSettings(radius=0.25, probes=8, max_rays=64, min_rays=4, directions=64)
     for config, options in ((PLAIN, {}), (VIEW_TARGETS_SMALL, {"loss": "likelihood"})):
         field, provenance = train(NOWHERE, replace(settings, **options), config, probes, both)
         assert provenance["rays"] == 400 and provenance["salience_views"] == 6 and provenance["probes_made"] == 14

@@ -57,7 +57,7 @@ def test_stages_fill_the_progress_in_proportion_to_their_costs():
 # ---- Selection of the prior by held-out participants and positions ----
 
 PLAIN = replace(LOG, prior_factor=False)
-PROBES_HERE = ProbeSettings(radius=0.3, count=48, min_rays=1, kappa=20.0, directions=128, weights="person")
+PROBES_HERE = ProbeSettings(radius=0.3, probes=48, min_rays=1, kappa=20.0, directions=128, ray_weights="person")
 
 
 def people(law: float, seed: int = 0, count: int = 6, each: int = 400) -> Rays:
@@ -79,7 +79,8 @@ def people(law: float, seed: int = 0, count: int = 6, each: int = 400) -> Rays:
 
 def plan_of(**changes):
     settings = replace(
-        LIKELIHOOD, **{"mix_folds": 3, "zones": 0, "steps": 300, "probes": 16, "weight_decay": 0.0, **changes}
+        LIKELIHOOD,
+        **{"prior_folds": 3, "validation_zones": 0, "steps": 300, "probes": 16, "weight_decay": 0.0, **changes},
     )
     return planned(PLAIN, settings, PROBES_HERE)
 

@@ -30,13 +30,13 @@ from .looks import SMALL as PRODUCT
 FAST = GazeSettings(
     steps=150,
     loss="likelihood",
-    integral=0.0,
+    integral_weight=0.0,
     probes=4,
     directions=128,
     rays=64,
     learning_rate=1e-2,
     weight_decay=0.1,
-    zones=0,
+    validation_zones=0,
     ema_decay=0.9,
 )
 
@@ -159,7 +159,7 @@ def test_one_probe_is_learnt(rays, wall):
     probes = place_probes(rays, 0.5, queries=[[-0.6, 0, 1.6]], min_rays=8, kappa_rule="fixed", kappa=20.0)
     targets = make_targets_from_probes(probes, wall, 256)
     np.testing.assert_allclose(4 * np.pi * targets.truth.mean(), 1, atol=0.01)
-    settings = GazeSettings(steps=200, learning_rate=1e-2, weight_decay=0.0, zones=0)
+    settings = GazeSettings(steps=200, learning_rate=1e-2, weight_decay=0.0, validation_zones=0)
     trainer = ProductTrainer(targets, BOX, PRODUCT, settings, ns)
     before = trainer.evaluate(targets)
     for _ in range(200):
@@ -172,7 +172,7 @@ def test_one_probe_is_learnt(rays, wall):
 @pytest.mark.parametrize("loss, judged", [("paper", 0.5 + 0.25 + 0.01), ("code", 0.1 * 0.25 + 0.01)])
 def test_validation_objective_is_the_training_loss(rays, wall, loss, judged):
     probes = place_probes(rays, 0.5, queries=[[-0.6, 0, 1.6]], min_rays=8, kappa_rule="fixed", kappa=20.0)
-    settings = GazeSettings(steps=1, loss=loss, integral=2.0, zones=0)
+    settings = GazeSettings(steps=1, loss=loss, integral_weight=2.0, validation_zones=0)
     trainer = ProductTrainer(make_targets_from_probes(probes, wall, 64), BOX, PRODUCT, settings, ns)
     assert trainer.validation_objective(kld=0.5, cc=0.75, mae=0.01, off=0.1) == pytest.approx(judged + 0.2)
 

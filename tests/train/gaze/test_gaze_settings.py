@@ -183,7 +183,7 @@ def test_recipes_are_complete(name):
 
 def test_default_recipe_has_more_patience_with_views_only():
     plain, alone = (get_recipe().make_plan(SCENE, views_only=alone).settings for alone in (False, True))
-    assert plain.zones == 0 and alone.zones == 3 and alone.steps > plain.steps
+    assert plain.validation_zones == 0 and alone.validation_zones == 3 and alone.steps > plain.steps
     # Other recipes keep their length.
     assert all("steps" not in get_recipe(name).views_only_settings for name in ("small", "paper"))
 
@@ -246,7 +246,7 @@ def test_features_and_weights_are_those_of_a_radiance_field():
 def test_the_papers_recipe_is_fifty_epochs_at_a_rate_that_falls_from_the_start():
     """Each probe is drawn fifty times; the rate decreases with every step, down to a tenth."""
     recipe = get_recipe("paper")
-    assert recipe.settings["steps"] * recipe.settings["probes"] == 50 * recipe.probes["count"]
+    assert recipe.settings["steps"] * recipe.settings["probes"] == 50 * recipe.probes["probes"]
     settings = GazeSettings(**recipe.settings)
     assert settings.learning_rate_at(0) == pytest.approx(1e-3) and settings.learning_rate_at(0.01) < 1e-3
     assert settings.learning_rate_at(0.5) == pytest.approx(1e-3 * 0.1**0.5) and settings.learning_rate_at(

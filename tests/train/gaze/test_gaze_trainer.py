@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import drjit.llvm.ad as ns
@@ -21,6 +22,7 @@ from nerg_mi.train.gaze_product import ProductTrainer
 from nerg_mi.train.gaze_run import make_targets
 from nerg_mi.train.gaze_settings import GazeSettings
 from nerg_mi.train.gaze_trainer import GazeRunFile, GazeTrainer, Scores, StateSettings, fit_with_validation, refit
+from nerg_mi.train.trainer import check_same_run
 from tests.refusals import mentions
 
 from .looks import (
@@ -56,7 +58,7 @@ def test_early_stopping(wall, patience, looks):
         steps=20,
         num_validations=10,
         patience=patience,
-        zones=2,
+        validation_zones=2,
         validation_probes=6,
         probes=4,
         directions=32,
@@ -92,7 +94,7 @@ def test_the_state_of_the_smallest_loss_is_the_result(targets_fit, monkeypatch, 
 def test_a_fit_without_validation_ends_with_its_schedule(targets_fit):
     messages = []
     fit = fit_with_validation(
-        targets_fit, None, BOX, planned(SMALL, replace(PRODUCT, zones=0)), ns, 1.0, NO_FILE, messages.append
+        targets_fit, None, BOX, planned(SMALL, replace(PRODUCT, validation_zones=0)), ns, 1.0, NO_FILE, messages.append
     )
     assert (fit.best_step, fit.schedule, fit.scores, fit.history, fit.interrupted) == (16, 16, None, [], False)
     assert (
@@ -133,7 +135,7 @@ def test_a_schedule_in_minutes_is_converted_to_steps(targets_fit, monkeypatch, s
         if progress.steps == stopped:
             raise KeyboardInterrupt
 
-    plan = planned(SMALL, replace(PRODUCT, steps=None, minutes=1.0, zones=0))
+    plan = planned(SMALL, replace(PRODUCT, steps=None, minutes=1.0, validation_zones=0))
     fit = fit_with_validation(targets_fit, None, BOX, plan, ns, 0.5, NO_FILE, stop)
     assert fit.schedule == 5 and fit.best_step == min(stopped, 5)
 
@@ -169,7 +171,11 @@ def test_run_identities_differ(name, plan, supervision, place, identity):
 
 @pytest.mark.parametrize(
     "settings, config, probes, count",
-    [(PRODUCT, SMALL, PROBES, 1), (LIKELIHOOD, LOG, replace(PROBES, fresh=True), 1), (LIKELIHOOD, LOG, PROBES, 2)],
+    [
+        (PRODUCT, SMALL, PROBES, 1),
+        (LIKELIHOOD, LOG, replace(PROBES, resample_directions=True), 1),
+        (LIKELIHOOD, LOG, PROBES, 2),
+    ],
     ids=["product", "fresh", "two threads"],
 )
 def test_a_resumed_run_equals_an_uninterrupted_one(wall, settings, config, probes, count, threads, tmp_path):
@@ -218,6 +224,35 @@ def test_another_run_is_not_resumed(wall, tmp_path):
         train(wall, PRODUCT, SMALL, replace(PROBES, kappa=9.0), path=path, resume=True, identity={"place": "elsewhere"})
     with pytest.raises(NergError, match="cannot resume"):
         train(wall, PRODUCT, SMALL, path=tmp_path / "b.run", resume=True)
+
+
+def test_a_run_with_old_names_of_settings_is_the_same_run():
+    """The identity as versions wrote it whose settings had other names than the options."""
+    now = json.loads(json.dumps(planned(SMALL, PRODUCT).make_identity(Supervision(RAYS), NOWHERE, StateSettings())))
+    old_names = {
+        "settings": {
+            "validation_zones": "zones",
+            "integral_weight": "integral",
+            "prior_folds": "mix_folds",
+            "freeze": "frozen",
+            "ema_decay": "average",
+        },
+        "probes": {
+            "probes": "count",
+            "max_rays": "cap",
+            "resample_directions": "fresh",
+            "ray_weights": "weights",
+            "prior_kappa": "mix_kappa",
+        },
+    }
+    then = {**now}
+    for part, names in old_names.items():
+        assert names.keys() <= now[part].keys()
+        then[part] = {names.get(name, name): value for name, value in now[part].items()}
+    check_same_run("a.run", then, now)
+    then["probes"] |= {"cap": 1 + then["probes"]["cap"]}
+    with pytest.raises(NergError, match="different probes;"):
+        check_same_run("a.run", then, now)
 
 
 def test_the_state_is_saved_at_intervals_and_on_request(monkeypatch, tmp_path):
@@ -286,7 +321,7 @@ def test_a_result_that_cannot_be_written_is_saved(wall, refit, threads, tmp_path
 def test_a_failed_write_of_an_interrupted_run_changes_nothing(wall, zones, threads, tmp_path):
     """The state is that of the step, and not the result, whose weights would otherwise count as the best ones."""
     threads(1)
-    settings = replace(PRODUCT, zones=zones, num_validations=2)
+    settings = replace(PRODUCT, validation_zones=zones, num_validations=2)
 
     def refuse(field, provenance):
         raise NergError("the disk is full.")
@@ -314,7 +349,7 @@ def targets_trainer(rays, wall):
 @pytest.mark.parametrize("average", [0.0, 0.3, 0.999])
 def test_the_result_is_the_average_of_the_weights(targets_trainer, average):
     """Exponential average with a short memory at first: (k + 1) / (k + 10) after k steps, at most ``average``."""
-    settings = GazeSettings(steps=5, learning_rate=1e-2, zones=0, ema_decay=average)
+    settings = GazeSettings(steps=5, learning_rate=1e-2, validation_zones=0, ema_decay=average)
     trainer = ProductTrainer(targets_trainer, BOX, SMALL, settings, ns)
     expected = {k: v.numpy().astype(float) for k, v in trainer.optimiser.items()}
     for k in range(1, 6):
@@ -389,8 +424,8 @@ def test_directions_are_fresh_in_every_epoch(wall, monkeypatch):
     monkeypatch.setattr(
         gaze_data, "make_rotated_directions", lambda *options: drawn.append(sets(*options)) or drawn[-1]
     )
-    settings = replace(PRODUCT, zones=0, steps=9)
-    train(wall, settings, SMALL, replace(PROBES, fresh=True))
+    settings = replace(PRODUCT, validation_zones=0, steps=9)
+    train(wall, settings, SMALL, replace(PROBES, resample_directions=True))
     assert len(drawn) == 3 and np.abs(drawn[0] - drawn[1]).max() > 0.1 and np.abs(drawn[1] - drawn[2]).max() > 0.1
     drawn.clear()
     train(wall, settings, SMALL)
