@@ -25,6 +25,7 @@ from . import llvm as _llvm
 from . import registration as _registration
 
 if TYPE_CHECKING:
+    from .alignment.align import align
     from .api.analysis import (
         bake,
         draw,
@@ -40,7 +41,7 @@ if TYPE_CHECKING:
     from .api.evaluation import evaluate_gaze, evaluate_radiance, folds, next_look, study
     from .api.gaze import load_gaze
     from .api.query import attention, observe, trace
-    from .api.recordings import align, check_rays, filter_rays, guess, import_rays, plot_rays, split_rays
+    from .api.recordings import check_rays, filter_rays, guess, import_rays, plot_rays, split_rays
     from .api.render import render
     from .api.scene import Scene, make_scene
     from .api.training import train_gaze, train_prior, train_radiance
@@ -65,7 +66,7 @@ _MODULES = {
     "NergError": "nerg_mi.errors",
     "Rays": "nerg_mi.rays.rays",
     "Scene": "nerg_mi.api.scene",
-    "align": "nerg_mi.api.recordings",
+    "align": "nerg_mi.alignment.align",
     "attention": "nerg_mi.api.query",
     "bake": "nerg_mi.api.analysis",
     "check_rays": "nerg_mi.api.recordings",

@@ -331,7 +331,7 @@ def _make_surface(means, solid, free, lower, step, has_free_space: bool) -> Scen
 
 # ---- Evidence ----
 #
-# Each kind of evidence is a class that implements `Evidence`. Register a new kind in `nerg_mi.workflows.align`.
+# Each kind of evidence is a class that implements `Evidence`. Register a new kind in `nerg_mi.alignment.align`.
 
 ProgressCallback = Callable[[float, str], None]  # called with the completed fraction and a description
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from nerg_mi.errors import NergError, clean_text
 from nerg_mi.files.values import FilePath
 from nerg_mi.rays.rays import Rays
-from nerg_mi.workflows.rays_commands import AlignOptions, FilterOptions, PlotOptions, RaysImportOptions, SplitOptions
+from nerg_mi.workflows.rays_commands import FilterOptions, PlotOptions, RaysImportOptions, SplitOptions
 
 from .arguments import check_names, check_output, resolve_file
 from .calls import Progress, report_progress, show_figure
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from nerg_mi.alignment.check import Alignment
     from nerg_mi.rays.guess import Proposal
     from nerg_mi.rays.in_memory import QualityReport
 
@@ -106,59 +105,6 @@ def import_rays(
             reader=reader, settings=make_options(reader, reader_values), output=output, **import_values
         )
         return rays.import_rays(paths, resolved, reporter).rays
-
-
-def align(
-    rays: Rays | FilePath | None = None,
-    output: FilePath | None = None,
-    *,
-    options: AlignOptions | None = None,
-    progress: Progress = None,
-    **overrides: Any,
-) -> Alignment:
-    """Estimate the similarity transform from the frame of recordings to the frame of an environment.
-
-    Parameters
-    ----------
-    rays : Rays or path, optional
-        Recordings (z up, metres). Not needed if other evidence is given.
-    output : path, optional
-        Alignment file (.json) to write, for the option ``align`` of `train_gaze`, together with a picture.
-    options : AlignOptions, optional
-        Base options (`nerg_mi.workflows.rays_commands.AlignOptions`).
-    progress : bool, Reporter or None
-        None shows a progress bar in notebooks, True shows one anywhere, False none; a `Reporter` receives everything.
-    **overrides
-        Single options on top of ``options``: the environment (``geometry``, which may be in memory), the evidence
-        (``pairs``, ``tracking_surface``, ``tracking_cameras`` with
-        ``scene_cameras``; by default the recordings alone), and known parts
-        (``up``, ``scale``, ...).
-
-    Returns
-    -------
-    Alignment
-        The transform and its quality.
-
-    Raises
-    ------
-    NergError
-        The evidence is insufficient, the frames are mirrored, or the fit is bad.
-
-    Examples
-    --------
-    >>> import nerg_mi as nerg
-    >>> rows = "0,0,0,1,0,0\\n2,0,0,5,0,0\\n0,1,0,1,2,0\\n0,0,1,1,0,2\\n"
-    >>> _ = (folder / "pairs.csv").write_text("x,y,z,place_x,place_y,place_z\\n" + rows)
-    >>> alignment = nerg.align(pairs=folder / "pairs.csv")
-    >>> (alignment.matrix.round(6) + 0.0)[0].tolist()
-    [2.0, 0.0, 0.0, 1.0]
-    """
-    from nerg_mi.workflows import align as alignment
-
-    check_output(output)
-    with report_progress(progress) as reporter:
-        resolved = build_options(AlignOptions, "align", options, overrides)
-        return alignment.align(None if rays is None else resolve_rays(rays), output, resolved, reporter).alignment
 
 
 def guess(files: FilePath | Sequence[FilePath], *, progress: Progress = None) -> list[Proposal]:

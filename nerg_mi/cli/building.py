@@ -281,6 +281,7 @@ def make_callback(command: Command) -> Callable[..., None]:
 _FLAGS = {
     "columns": "--map",
     "defaults": "--define",
+    "environment": "--field",
     "handedness": "--hand",
     "observers": "--observer",
     "persons": "--person",

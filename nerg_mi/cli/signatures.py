@@ -16,6 +16,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, get_type_hints
 
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.options import MAIN, TRAINING, cpu_threads, llvm_variant, option
 from nerg_mi.progress import Reporter
 from nerg_mi.ranges import RANGE, find_ranges
@@ -33,20 +34,29 @@ _DEVICE = {"threads": ("int | None", cpu_threads()), "mode": ("str", llvm_varian
 def make_command(row: Row) -> Command:
     """Return the command of a ``row``."""
     function = read_signature(row.function)
-    parameters, texts = inspect.signature(function).parameters, read_parameter_texts(function)
+    parameters = inspect.signature(function).parameters
+    flags = {name: f"--{next(iter(row.alternatives.get(name, [name]))).replace('_', '-')}" for name in parameters}
+    texts = {
+        name: re.sub("``(\\w+)``", lambda m: flags.get(m[1], m[1]), text)
+        for name, text in read_parameter_texts(function).items()
+    }
     kinds = {name: _find_kind(function, name) for name in parameters if name != "progress"}
     arguments = {
         name: argument(texts[name], kinds[name], required=parameters[name].default is _EMPTY) for name in row.arguments
     }
     writes = "output" in parameters
     if writes:
-        arguments["output"] = out(texts["output"], default=... if parameters["output"].default is _EMPTY else None)
+        is_required = row.output or parameters["output"].default is _EMPTY
+        arguments["output"] = out(row.output or texts["output"], default=... if is_required else None)
     elif row.output:
         arguments["output"] = out(row.output)
     members, settings, ranges = list[Any](), dict[str, Any](), find_ranges(function)
     for name in (name for name in kinds if name not in arguments):
         default = parameters[name].default
-        if is_dataclass(default):
+        if name in row.alternatives:
+            files = row.alternatives[name].items()
+            members += [(file, Path | None, option(None, help, group=MAIN)) for file, help in files]
+        elif is_dataclass(default):
             settings[name] = type(default)
             members += [(f.name, f.type, _repeat(f)) for f in fields(default) if "help" in f.metadata]
         else:
@@ -66,6 +76,11 @@ def make_command(row: Row) -> Command:
         for name, kind in settings.items():
             shown = [f.name for f in fields(kind) if hasattr(options, f.name)]
             chosen[name] = kind(**{field: getattr(options, field) for field in shown})
+        for name, files in row.alternatives.items():
+            paths = {parameter(file): path for file in files if (path := getattr(options, file)) is not None}
+            if len(paths) > 1:
+                raise NergError(f"{' and '.join(paths)} are alternatives: give one of them")
+            chosen[name] = next(iter(paths.values()), None)
         result = import_function(row.function)(**values, **chosen, progress=reporter)
         if output is not None:
             result.save(output)

@@ -6,7 +6,8 @@ texts are those of the docstring, and ranges those of the annotations (`.signatu
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 
 @dataclass(frozen=True)
@@ -15,7 +16,9 @@ class Row:
 
     ``arguments`` are the parameters without a flag, in order. ``output`` is the help of ``--output``, to which the
     result is saved, and ``suffixes`` are those of this file; a function that writes during its work has a parameter
-    ``output`` in place of it. A command that ``computes`` has ``--mode``.
+    ``output``, which the command requires if it has this help. ``alternatives`` are options for files of different
+    kinds, with their help, of which at most one is given, by the parameter that takes them. A command that
+    ``computes`` has ``--mode``.
     """
 
     name: str
@@ -25,9 +28,23 @@ class Row:
     output: str = ""
     suffixes: tuple[str, ...] = ()
     computes: bool = True
+    alternatives: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
 
 
 TABLE = (
+    Row(
+        "align",
+        "nerg_mi.alignment.align:align",
+        "Register tracking with a scene: estimate, check and write the alignment.",
+        ("rays",),
+        "Alignment to write (.json), for --align of other commands; a plot is written next to it.",
+        alternatives={
+            "environment": {
+                "field": "Radiance field (.safetensors) or Gaussian splats of the scene.",
+                "scene": "Mitsuba scene (.xml) or mesh, in place of --field.",
+            }
+        },
+    ),
     Row(
         "poses",
         "nerg_mi.train.poses:find_poses",

@@ -203,13 +203,10 @@ def _changed_options(settings: Any) -> dict[str, Any]:
 
 
 def changed_arguments(function: Callable[..., Any], values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the ``values`` of optional parameters of ``function`` that are neither None nor the default, by name."""
-    defaults = {name: p.default for name, p in inspect.signature(function).parameters.items() if name != "progress"}
-    return {
-        name: values[name]
-        for name, default in defaults.items()
-        if default is not inspect.Parameter.empty and values[name] is not None and values[name] != default
-    }
+    """Return the ``values`` of settings (keywords) of ``function`` that are neither None nor the default, by name."""
+    keywords = [p for p in inspect.signature(function).parameters.values() if p.kind is p.KEYWORD_ONLY]
+    settings = {p.name: p.default for p in keywords if p.name not in ("output", "progress")}
+    return {k: values[k] for k, default in settings.items() if values[k] is not None and values[k] != default}
 
 
 def _to_json(value: Any) -> Any:

@@ -6,9 +6,8 @@
 ``nerg rays events``: Detect fixations, saccades, pursuits and pauses, and measure data quality, per recording.
 ``nerg rays export``: Write rays in a format of other programs: a BIDS dataset with gaze, events and visits.
 ``nerg rays plot``: Plot a floor plan of recorded positions, as densities or as the layout of a split.
-``nerg align``: Register tracking with a scene: find the similarity from the rays' frame to the scene's.
 
-Options of these commands. The workflows are in `.rays`, `.rays_events`, `.rays_export` and `.align`.
+Options of these commands. The workflows are in `.rays`, `.rays_events` and `.rays_export`.
 """
 
 from __future__ import annotations
@@ -30,12 +29,9 @@ from nerg_mi.options import (
     EventOptions,
     best_variant,
     coordinates,
-    cpu_threads,
-    llvm_variant,
     option,
-    random_seed,
 )
-from nerg_mi.ranges import COORDINATES, LENGTHS, RAYS, SECONDS, SEEDS, THREADS, TIMES, Range, ValidatedDataclass
+from nerg_mi.ranges import LENGTHS, RAYS, SECONDS, SEEDS, THREADS, TIMES, Range, ValidatedDataclass
 
 from .base import HelpView, Parameter, argument, declare, extra, out
 
@@ -486,97 +482,4 @@ declare(
     options=PlotOptions,
     rays=_RAYS_FILE,
     output=out("Image to write (.png or .svg)."),
-)
-
-
-# ---- Alignment ----
-
-
-@dataclass(frozen=True, kw_only=True)
-class AlignOptions(ValidatedDataclass):
-    """Options of ``nerg align``. Lengths of the tracking are in metres."""
-
-    field: Path | None = option(None, "Radiance field (.safetensors) or Gaussian splats of the scene.", group=INPUT)
-    scene: Path | None = option(None, "Mitsuba scene (.xml), in place of --field.", group=INPUT)
-    surface: Path | None = option(
-        None,
-        "Surface of the scene, in place of --field: a mesh or points (.ply, .obj, .glb, .npy, .csv with x,y,z, or "
-        "points of Aria).",
-        group=INPUT,
-    )
-    pairs: Path | None = option(
-        None,
-        "Three or more point correspondences: CSV with columns x,y,z,place_x,place_y,place_z, or JSON.",
-        group=INPUT,
-    )
-    tracking_surface: Path | None = option(
-        None,
-        "Surface in the frame of the tracking, a mesh or points as for --surface; it is registered by ICP.",
-        group=INPUT,
-    )
-    tracking_cameras: Path | None = option(
-        None, "Posed photos in the frame of the tracking (transforms.json, COLMAP); needs --scene-cameras.", group=INPUT
-    )
-    scene_cameras: Path | None = option(
-        None, "The same photos posed in the frame of the scene (transforms.json, COLMAP).", group=INPUT
-    )
-    init: Path | None = option(None, "Approximate alignment (.json) that the tracking refines.", group=INPUT)
-    refine: bool = option(
-        False, "Refine the alignment found from points, surfaces or cameras with the tracking.", group=ANALYSIS
-    )
-    up: str | None = option(
-        None,
-        "Up axis of the scene: x, y, z, -x, -y, -z or x,y,z. Only rotations about it remain to be found; the tracking "
-        "is z up.",
-        group=ANALYSIS,
-    )
-    floor_height: float = option(
-        0.0, "Height of the floor in the frame of the tracking, in metres.", within=COORDINATES, group=ANALYSIS
-    )
-    scene_floor_height: float | None = option(
-        None,
-        "Height of the floor in the scene along --up, in scene units.  [default: estimated]",
-        within=COORDINATES,
-        group=ANALYSIS,
-    )
-    scale: float | None = option(
-        None, "Scene units per metre of the tracking.  [default: estimated]", within=LENGTHS, group=ANALYSIS
-    )
-    turn: float | None = option(
-        None,
-        "Rotation about --up from the frame of the tracking to that of the scene, turned to z up, in degrees, "
-        "anticlockwise as seen from above.  [default: estimated]",
-        within=Range(-360, 360),
-        group=ANALYSIS,
-    )
-    shift: str | None = option(
-        None,
-        "Position of the origin of the tracking in the scene, x,y,z in scene units.  [default: estimated]",
-        group=ANALYSIS,
-    )
-    max_residual: float = option(
-        10.0,
-        "Maximum median residual in centimetres; alignments with a larger one are rejected.",
-        within=Range(0, 10**9),
-        group=ANALYSIS,
-    )
-    force: bool = option(False, "Write the alignment even if it is rejected.", group=OUTPUT)
-    seed: int = random_seed("rays that sample the scene, and for intervals")
-    threads: int | None = cpu_threads()
-    mode: str = llvm_variant()
-
-
-declare(
-    "align",
-    "nerg_mi.workflows.align:align",
-    "Register tracking with a scene: find the similarity transform from the frame of the rays to that of the scene.",
-    more="""The transform is found from point correspondences, two surfaces, cameras posed in both frames, or the
-tracking alone: heads are in free space, and gaze ends on surfaces. A mirrored frame is detected and reported. Without
-hit points, the ranges of turns, scales and shifts that fit are reported, and wide ones are rejected.""",
-    options=AlignOptions,
-    rays=argument(
-        "Rays file (.npz or .parquet). Not needed with --pairs, --tracking-surface or --tracking-cameras.",
-        required=False,
-    ),
-    output=out("Alignment to write (.json), for --align of other commands; a plot is written next to it."),
 )

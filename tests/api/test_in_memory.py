@@ -24,7 +24,6 @@ from nerg_mi.fields.splats import Splats
 from nerg_mi.progress import SilentReporter
 from nerg_mi.rendering.scene import list_scene_files, load_scene
 from nerg_mi.workflows.gaze_commands import FoldOptions, GazeOptions
-from nerg_mi.workflows.rays_commands import AlignOptions
 from nerg_mi.workflows.view import make_viewer_scene
 
 QUICK = {"recipe": "small", "steps": 2, "probes": 8, "directions": 64, "min_rays": 8, "validation_zones": 0}
@@ -319,13 +318,13 @@ def test_environments_are_shown(rgb_module, rays, tmp_path, kind):
 def test_environments_have_one_argument_each(rgb_module, rays, name):
     """A grid is written as a scene file, and splats as a field, whatever the argument is called."""
     for environment, option in ((make_grid(), "scene"), (make_splats(), "field"), (make_room(), "scene")):
-        resolved = build_options(AlignOptions, "align", None, {name: environment})
+        resolved = build_options(GazeOptions, "train_gaze", None, {name: environment})
         assert [n for n in ("field", "scene") if getattr(resolved, n) is not None] == [option]
     with pytest.raises(nerg.NergError, match=f"{name} must be .* Rays"):
-        nerg.align(rays, **{name: rays})
+        nerg.train_gaze(rays, **{name: rays})
     other = "field" if name == "scene" else "scene"
     with pytest.raises(nerg.NergError, match="both"):
-        nerg.align(rays, **{name: make_room(), other: make_grid()})
+        nerg.train_gaze(rays, **{name: make_room(), other: make_grid()})
 
 
 def test_recordings_are_aligned_with_a_grid(rgb_module):
@@ -338,7 +337,7 @@ def test_recordings_are_aligned_with_a_grid(rgb_module):
     moved = nerg.Rays.from_arrays(
         eyes + shift, seen - eyes, times=np.arange(1500) / 30, participants=names, hits=seen + shift
     )
-    alignment = nerg.align(moved, field=make_grid(), turn=0, scale=1)
+    alignment = nerg.align(moved, make_grid(), turn=0, scale=1)
     np.testing.assert_allclose(alignment.matrix[:3, 3], -shift, atol=0.06)
 
 
@@ -569,7 +568,6 @@ def test_tables_in_place_of_rays_are_refused_with_the_way_to_rays(gaze, room):
 def test_objects_in_place_of_outputs_are_refused(gaze, rays, room):
     for call in (
         lambda: nerg.train_gaze(rays, room),
-        lambda: nerg.align(rays, room),
         lambda: nerg.bake(room, gaze),
         lambda: nerg.bake(room, [gaze]),
         lambda: nerg.report(gaze, rays),

@@ -119,7 +119,7 @@ CALLS = [
     (lambda: nerg.train_radiance("no"), 'file "no" of "photos" does not exist'),
     (lambda: nerg.evaluate_gaze("no.safetensors", "no.npz"), "no.npz"),
     (lambda: nerg.evaluate_radiance(3, "."), '"field" must be .* a file, .* got int'),
-    (lambda: nerg.align("no.npz", scene="no.xml"), "no.xml"),
+    (lambda: nerg.align("no.npz", "no.xml"), "no.npz"),
     (lambda: nerg.study(3, "new"), '"scene" must be .* a file, .* got int'),
     (lambda: nerg.import_rays(np.zeros(3)), "reads files, .* got ndarray; use Rays.from_dataframe"),
     (lambda: nerg.import_rays("no.csv", colums="t=t"), 'has no option "colums"; did you mean "columns"'),

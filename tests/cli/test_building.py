@@ -7,7 +7,7 @@ import math
 import re
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -103,7 +103,7 @@ Greetings, for a test.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from nerg_mi.workflows.base import argument, command
 from nerg_mi.options import option
@@ -195,7 +195,7 @@ def play(
     return note
 
 
-def record(names: Sequence[FilePath], output: FilePath, *, progress: Progress = None):
+def record(names: Sequence[FilePath], output: FilePath, *, room: FilePath | None = None, progress: Progress = None):
     """Record notes.
 
     Parameters
@@ -204,10 +204,13 @@ def record(names: Sequence[FilePath], output: FilePath, *, progress: Progress = 
         What is recorded.
     output : path
         Folder to write.
+    room : path, optional
+        Where it is played.
     progress : bool, Reporter or None
         Progress.
     """
     Path(output).mkdir()
+    progress.message(f"recorded in {room}")
 
 
 def test_a_command_is_one_row(monkeypatch, tmp_path, capsys):
@@ -246,11 +249,19 @@ def test_a_command_is_one_row(monkeypatch, tmp_path, capsys):
 
 def test_a_function_with_an_output_writes_during_its_work(monkeypatch, tmp_path, capsys):
     row = Row("record", f"{__name__}:record", "Record.", ("names",), computes=False)
+    row = replace(row, alternatives={"room": {"hall": "A hall.", "studio": "A studio."}})
     monkeypatch.setitem(ROWS, "record", row)
     monkeypatch.setattr(building, "TABLE", (row,))
     with pytest.raises(SystemExit) as end:
         nerg_mi.cli.main(["record", "a", "-o", str(tmp_path / "notes")])
-    assert not end.value.code and (tmp_path / "notes").is_dir() and "wrote" not in capsys.readouterr().out
+    assert not end.value.code and (tmp_path / "notes").is_dir()
+    assert capsys.readouterr().out == "recorded in None\n"
+    with pytest.raises(SystemExit) as end:
+        nerg_mi.cli.main(["record", "a", "-o", str(tmp_path / "more"), "--studio", "b"])
+    assert not end.value.code and capsys.readouterr().out == "recorded in b\n"
+    with pytest.raises(SystemExit) as end:
+        nerg_mi.cli.main(["record", "a", "-o", str(tmp_path / "third"), "--studio", "b", "--hall", "c"])
+    assert end.value.code == 1 and "--hall and --studio" in capsys.readouterr().err
     with pytest.raises(SystemExit) as end:
         nerg_mi.cli.main(["record", "a"])
     assert end.value.code == 2

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import csv
 import json
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from nerg_mi.alignment import align as alignment
 from nerg_mi.alignment import profile
+from nerg_mi.alignment.align import align
 from nerg_mi.alignment.check import AlignmentCheck
 from nerg_mi.environment.environment import Environment
 from nerg_mi.errors import NergError
@@ -19,12 +22,9 @@ from nerg_mi.maths.geometry import Box
 from nerg_mi.rays.rays import Rays
 from nerg_mi.train import geometry_files as geometry
 from nerg_mi.train.geometry_files import check_geometry
-from nerg_mi.workflows import align as alignment
 from nerg_mi.workflows import demo, study
-from nerg_mi.workflows.align import align
 from nerg_mi.workflows.demo import STAGES, make_demo
 from nerg_mi.workflows.gaze_commands import GazeOptions
-from nerg_mi.workflows.rays_commands import AlignOptions
 from nerg_mi.workflows.scene_commands import DemoOptions, StudyOptions
 from nerg_mi.workflows.study import find_reference_scene, measure_part, plan_study, run_study
 from nerg_mi.workflows.train_gaze import train_gaze
@@ -171,8 +171,8 @@ def pairs(folder, noise=0.0, mirror=1.0):
 def test_an_alignment_is_written_with_its_figure(tmp_path):
     truth, path = pairs(tmp_path)
     reporter = Recorder()
-    result = align(None, tmp_path / "a.json", AlignOptions(pairs=path), reporter)
-    np.testing.assert_allclose(result.alignment.matrix, truth, atol=1e-6)
+    result = align(pairs=path, output=tmp_path / "a.json", progress=reporter)
+    np.testing.assert_allclose(result.matrix, truth, atol=1e-6)
     metadata = json.loads((tmp_path / "a.json").read_text())
     assert metadata["files"]["pairs"]["file"] == "pairs.csv" and metadata["forced"] is False
     assert (tmp_path / "a.png").is_file() and "align" in reporter.messages[-1]
@@ -181,19 +181,19 @@ def test_an_alignment_is_written_with_its_figure(tmp_path):
 def test_bad_and_mirrored_fits_are_refused_unless_forced(tmp_path):
     _, path = pairs(tmp_path, noise=0.5)
     with pytest.raises(NergError, match=r"give other evidence, or a larger limit; or add"):
-        align(None, tmp_path / "a.json", AlignOptions(pairs=path))
+        align(pairs=path, output=tmp_path / "a.json")
     assert not (tmp_path / "a.json").exists()
-    assert align(None, tmp_path / "a.json", AlignOptions(pairs=path, force=True)).alignment.forced
+    assert align(pairs=path, output=tmp_path / "a.json", force=True).forced
     _, path = pairs(tmp_path, mirror=-1)
     with pytest.raises(NergError, check=lambda error: error.kind == "mirrored" and mentions("handedness")(error)):
-        align(None, None, AlignOptions(pairs=path))
+        align(pairs=path)
 
 
 @pytest.mark.parametrize(
     "options, rays, why",
     [
         ({}, None, "or add pairs=FILE, tracking_surface=FILE,"),
-        ({}, RAYS, "no scene is given: add field=FILE, scene"),
+        ({}, RAYS, "no scene is given: add environment=FILE, or surface"),
         ({"tracking_cameras": "a"}, None, "tracking_cameras and scene_cameras must be"),
         ({"pairs": "a", "tracking_surface": "b"}, None, "are alternatives"),
         ({"pairs": "a", "init": "b"}, None, "are alternatives"),
@@ -201,23 +201,24 @@ def test_bad_and_mirrored_fits_are_refused_unless_forced(tmp_path):
         ({"pairs": "PAIRS", "up": "north"}, None, "up must be comma-separated numbers, got"),
         ({"pairs": "PAIRS", "up": "0,0,0"}, None, "or three numbers x,y,z that are not all"),
         ({"pairs": "PAIRS", "scale": -1.0}, None, "scale must lie in"),
-        ({"pairs": "PAIRS", "field": "a", "scene": "b"}, None, "only one scene can be given: use field or"),
+        ({"pairs": "PAIRS", "environment": "a", "surface": "b"}, None, "only one scene can be given: use environment"),
     ],
 )
 def test_contradictory_options_are_refused(tmp_path, options, rays, why):
     _, path = pairs(tmp_path)
     settings = {k: path if v == "PAIRS" else v for k, v in options.items()}
     with pytest.raises(NergError, match=why):
-        align(rays, None, AlignOptions(**settings))
+        align(rays, **settings)
 
 
 def test_up_axis_and_initial_alignment_give_the_same_frame(tmp_path, monkeypatch):
     truth, path = pairs(tmp_path)
     np.save(tmp_path / "points.npy", rooms.carried(truth, rooms.traces(8000).end))
-    aligned = align(None, tmp_path / "a.json", AlignOptions(pairs=path))
-    options = AlignOptions(init=tmp_path / "a.json", surface=tmp_path / "points.npy")
-    again = align(RAYS, None, options).alignment
-    off = rooms.carried(again.matrix, RAYS.origin) - rooms.carried(aligned.alignment.matrix, RAYS.origin)
+    aligned = align(pairs=path, output=tmp_path / "a.json")
+    again = align(RAYS, init=tmp_path / "a.json", surface=tmp_path / "points.npy")
+    same = align(RAYS, init=aligned, surface=tmp_path / "points.npy")
+    np.testing.assert_array_equal(same.matrix, again.matrix)
+    off = rooms.carried(again.matrix, RAYS.origin) - rooms.carried(aligned.matrix, RAYS.origin)
     assert np.linalg.norm(off, axis=1).max() < 0.1 and again.evidence["kind"] == "tracking"
     assert alignment._turn("-y")[:3, :3] @ [0, -1, 0] == pytest.approx([0, 0, 1])
 
@@ -226,34 +227,34 @@ def test_undetermined_turn_is_refused_unless_forced(tmp_path, monkeypatch):
     monkeypatch.setattr(profile, "_TURNS", np.radians([10, 90, 180]))
     np.save(tmp_path / "points.npy", rooms.traces(8000).end)
     gaze, out = replace(RAYS, hit=None), tmp_path / "a.json"
-    options, reporter = AlignOptions(surface=tmp_path / "points.npy", scale=1.0), Recorder()
+    options, reporter = {"surface": tmp_path / "points.npy", "scale": 1.0}, Recorder()
     with pytest.raises(NergError, match=r"do not determine the turn.*turn.*force"):
-        align(gaze, out, options)
+        align(gaze, output=out, **options)
     assert not out.exists()
-    forced = align(gaze, out, replace(options, force=True), reporter).alignment
+    forced = align(gaze, output=out, **options, force=True, progress=reporter)
     low, high = forced.uncertainty["turn_degrees"]
     assert forced.forced and high - low > 10 and not any(line.startswith("residuals") for line in reporter.messages)
     with pytest.raises(NergError, match=r"a\.json.*do not determine the turn.*force"):
         plan = GazeOptions(align=out, scene=tmp_path / "a.xml", mode="llvm_ad_rgb")
         train_gaze(gaze, tmp_path / "gaze.safetensors", plan)
-    fixed = align(gaze, out, replace(options, turn=0.0, shift="0,0,0")).alignment
+    fixed = align(gaze, output=out, **options, turn=0.0, shift="0,0,0")
     assert np.allclose(fixed.matrix, np.eye(4)) and fixed.uncertainty["shift_cm"] == 0
 
 
 def test_turn_and_shift_hold_with_pairs(tmp_path):
     truth, path = pairs(tmp_path)
     shift = ",".join(map(str, truth[:3, 3]))
-    options = AlignOptions(pairs=path, up="y", shift=shift, force=True)
-    free = alignment._turn("y") @ align(None, None, options).alignment.matrix
+    options = {"pairs": path, "up": "y", "shift": shift, "force": True}
+    free = alignment._turn("y") @ align(**options).matrix
     degrees = np.degrees(np.arctan2(free[1, 0], free[0, 0])) + 10
-    result = align(None, None, replace(options, turn=degrees)).alignment
+    result = align(**options, turn=degrees)
     fixed = alignment._turn("y") @ result.matrix
     assert np.degrees(np.arctan2(fixed[1, 0], fixed[0, 0])) == pytest.approx(degrees)
     np.testing.assert_allclose(result.matrix[:3, 3], truth[:3, 3], atol=1e-9)
     with pytest.raises(NergError, match="no positive scale"):
-        align(None, None, replace(options, turn=degrees + 180))
-    fixed = AlignOptions(pairs=path, up="z", shift="1,2,3", scale=2.0, floor_height=0.5)
-    assert alignment._target(fixed, "pairs", Recorder())[1].scene_floor == pytest.approx(3 + 2 * 0.5)
+        align(**options, turn=degrees + 180)
+    constraints = alignment._find_constraints("z", 0.5, None, 2.0, None, "1,2,3")
+    assert constraints["scene_floor"] == pytest.approx(3 + 2 * 0.5)
 
 
 def place(alignment_check, monkeypatch):
@@ -277,13 +278,12 @@ def test_gaze_that_hits_no_surface_is_refused_and_doubts_are_reported(monkeypatc
     assert len(reporter.warnings) == 2
 
 
-@pytest.mark.parametrize("option", ["surface", "scene", "twin"])
+@pytest.mark.parametrize("option", ["surface", "environment", "tracking_surface"])
 def test_unused_parts_of_a_mesh_are_reported(tmp_path, option):
     (tmp_path / "a.obj").write_text("mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\n")
-    options, reporter = AlignOptions(**{option: tmp_path / "a.obj"}), Recorder()
-    if option == "twin":
-        alignment._evidence(options, None, reporter)
-    else:
-        alignment._target(options, "tracking", reporter)
+    reporter, (_, path) = Recorder(), pairs(tmp_path)
+    evidence = {} if option == "tracking_surface" else {"pairs": path, "force": True}
+    with pytest.raises(NergError, match="no scene") if option == "tracking_surface" else nullcontext():
+        align(**{option: tmp_path / "a.obj"}, **evidence, progress=reporter)
     (note,) = [m for m in reporter.messages if "mtllib" in m]
     assert str(tmp_path / "a.obj") in note and note.endswith(": mtllib")
