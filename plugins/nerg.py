@@ -174,8 +174,9 @@ whose ``update()`` refreshes the occupancy.
 Shapes of the scene hide the field behind them, from the camera and from the observer, and the field in front of them
 attenuates them. Depth on a shape is that of the exact ray cast, and gaze is evaluated there as on any surface. There is
 no light transport between both: a shape casts no shadow on the field, whose light is baked in, and the field casts none
-on a shape. Derivatives of ``mi.render`` include the radiance of shapes and store each bounce of ``path``; nest
-``direct`` to need less memory. Distances to shapes have derivatives, except across silhouettes.
+on a shape. Derivatives of ``mi.render`` include the radiance of shapes; those with respect to cameras and positions
+store each bounce of ``path`` (4 kB a path), and need less memory with ``direct``. Distances to shapes have derivatives,
+except across silhouettes.
 
 Inside another integrator (``aov``, ``moment``) the camera is searched among the scene's sensors; pass one of these to
 ``mi.render``, or give the integrator an explicit ``observer``. Spectral and polarized variants are not supported.

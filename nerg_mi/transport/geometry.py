@@ -341,8 +341,8 @@ class Shading:
     ) -> tuple[Color, list[Float], Bool]:
         """``(radiance, AOVs of the nested integrator, shown)`` from behind the medium, or from geometry without one.
 
-        Derivatives are those of the nested integrator, of the default ``path`` (in a derivative of an image, which
-        evaluates loops), or of the headlight.
+        Derivatives are those of the nested integrator, of the default ``path`` (in a derivative of an image), or of the
+        headlight.
 
         Parameters
         ----------
@@ -365,7 +365,7 @@ class Shading:
         environment: Any = None if hide_emitters else scene.environment()
         nested: Any = self.nested
         if nested is not None:
-            color, valid, aovs = nested.sample(scene, sampler, ray, medium, visible)
+            color, valid, aovs = _sample(nested, scene, sampler, ray, medium, visible)
             if environment is None:
                 # Directly visible emitters are shapes; without any surface there is the background.
                 color = dr.select(ray_hit.hits_shape | valid, color, background)
@@ -379,7 +379,7 @@ class Shading:
             # Dr.Jit has no reverse mode through a symbolic loop of paths; derivatives of an image evaluate loops.
             with dr.suspend_grad(when=dr.flag(dr.JitFlag.SymbolicLoops)):
                 self._path = self._path or mi.load_dict({"type": "path", "hide_emitters": bool(hide_emitters)})
-                shape = self._path.sample(scene, sampler, ray, None, hit)[0]
+                shape = _sample(self._path, scene, sampler, ray, None, hit)[0]
         else:
             si = ray_hit.shape_intersection.compute_surface_interaction(mi.Ray3f(ray), mi.RayFlags.All, hit)
             facing = dr.abs(dr.dot(si.sh_frame.n, ray.d))
@@ -389,6 +389,54 @@ class Shading:
     def aov_names(self) -> list[str]:
         """Names of the AOVs of the nested integrator."""
         return [] if self.nested is None else list(self.nested.aov_names())
+
+
+def _sample(integrator: Any, scene: Any, sampler: Any, ray: Ray3f, medium: Any, active: Bool) -> tuple[Any, Any, list]:
+    """Sample radiance along ``ray`` with ``integrator``.
+
+    The derivative of an image with respect to materials and lights replays the paths of ``path``: Dr.Jit would store
+    all their bounces, 4 kB a path, and the process would end when memory is full. Replayed paths have no derivatives of
+    rays and positions of shapes.
+    """
+    mi = variant_types()
+    is_path = integrator.class_name() == "PathIntegrator" and not dr.flag(dr.JitFlag.SymbolicLoops)
+    if not is_path or dr.grad_enabled(ray.o, ray.d) or scene.shapes_grad_enabled():
+        return integrator.sample(scene, sampler, ray, medium, active)
+    values = [value for child in (*scene.shapes(), *scene.emitters()) for _, value in mi.traverse(child)]
+    limits = {name: int(value) for name, value in re.findall(r"(max_depth|rr_depth) = (\d+)", str(integrator))}
+    # No limit is the largest integer.
+    limits = {name: value if value < 1 << 31 else -1 for name, value in limits.items()}
+    replay = mi.load_dict({"type": "prb", "hide_emitters": integrator.hide_emitters, **limits})
+    parameters = [value for value in values if dr.grad_enabled(value)]
+    color, valid = dr.custom(_PathReplay, replay, scene, sampler, ray, active, parameters)
+    return color, valid, []
+
+
+class _PathReplay(dr.CustomOp):
+    """Radiance of paths as one node of the AD graph: paths for the values, and the same paths for the derivatives."""
+
+    def eval(self, integrator, scene, sampler, ray, active, parameters):
+        for parameter in parameters:
+            self.add_input(parameter)
+        self.paths = integrator, scene, sampler.clone(), ray, active
+        self.color, valid = self._trace(dr.ADMode.Primal, sampler, None)[:2]
+        return self.color, valid
+
+    def _trace(self, mode, sampler, gradient):
+        integrator, scene, _, ray, active = self.paths
+        state = None if mode == dr.ADMode.Primal else self.color
+        with dr.suspend_grad(), dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, True):
+            return integrator.sample(mode, scene, sampler, ray, δL=gradient, state_in=state, active=active)
+
+    def backward(self):
+        adjoint: Any = self.grad_out()
+        self._trace(dr.ADMode.Backward, self.paths[2].clone(), adjoint[0])
+
+    def forward(self):
+        self.set_grad_out((self._trace(dr.ADMode.Forward, self.paths[2].clone(), None)[0], False))
+
+    def name(self):
+        return "path replay"
 
 
 def _beyond(ray: Ray3f) -> Any:

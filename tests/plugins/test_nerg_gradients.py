@@ -16,6 +16,7 @@ from .scenes import (
     put,
     scene_with,
     sphere,
+    square,
     still,
     stored,
     with_gaze,
@@ -386,3 +387,31 @@ def test_march_beside_a_differentiated_albedo_stays_one_kernel(rgb, learnt, kind
             put(params, key, rgb.Color3f(value))
             means.append(np.mean(np.array(rgb.render(scene, spp=64))[..., :3]))
     assert slope == pytest.approx((means[1] - means[0]) / 0.2, rel=0.05)
+
+
+@pytest.mark.parametrize("nested", [True, False])
+@pytest.mark.parametrize("key", ["ball.bsdf.reflectance.value", "light.emitter.radiance.value"])
+def test_derivatives_store_no_bounces_of_paths(rgb, nested, key):
+    """They would fill the memory: 4 kB a path."""
+    counts = []
+    for depth in (3, 12) if nested else (None,):
+        path = {"inner": {"type": "path", "max_depth": depth}} if nested else {}
+        lamp = {"type": "area", "radiance": {"type": "rgb", "value": 2.0}}
+        light = plugin("rectangle", to_world=look_at(rgb, (0, 4, 0), (0, 0, 2)).scale([2, 2, 1]), emitter=lamp)
+        shapes = {"ball": sphere(rgb, 0, 0, 2, radius=1.2), "floor": square(rgb, 4, size=4.0)}
+        scene = scene_with(rgb, constant(0.2, **path), small_camera(rgb), light=light, **shapes)
+        params = rgb.traverse(scene)
+        attach(params, key)
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            dr.backward(dr.mean(rgb.render(scene, params, spp=256)[..., :3]))
+            counts.append(len(dr.kernel_history([dr.KernelType.JIT])))
+        slope = np.array(dr.grad(params[key])).ravel().sum()
+        value = np.array(params[key]).mean()
+        with dr.suspend_grad():
+            means = []
+            for factor in (0.95, 1.05):
+                put(params, key, rgb.Color3f(factor * value))
+                means.append(np.mean(np.array(rgb.render(scene, spp=256))[..., :3]))
+        assert slope == pytest.approx((means[1] - means[0]) / (0.1 * value), rel=0.05) and slope > 0
+    assert len(set(counts)) == 1 and counts[0] < 20
