@@ -26,17 +26,7 @@ from . import registration as _registration
 
 if TYPE_CHECKING:
     from .alignment.align import align
-    from .api.analysis import (
-        bake,
-        draw,
-        export,
-        export_scene,
-        import_checkpoint,
-        render_film,
-        report,
-        statistics,
-        write_scene,
-    )
+    from .api.analysis import bake, draw, export, export_scene, render_film, report, statistics, write_scene
     from .api.arrays import Camera
     from .api.evaluation import evaluate_gaze, evaluate_radiance, folds, next_look, study
     from .api.gaze import load_gaze
@@ -46,6 +36,7 @@ if TYPE_CHECKING:
     from .api.scene import Scene, make_scene
     from .api.training import train_gaze, train_prior, train_radiance
     from .environment.contents import DensityGrid
+    from .environment.conversion import import_checkpoint
     from .environment.trained import load_field
     from .errors import NergError
     from .rays.dataset import load_rays
@@ -80,7 +71,7 @@ _MODULES = {
     "find_poses": "nerg_mi.train.poses",
     "folds": "nerg_mi.api.evaluation",
     "guess": "nerg_mi.api.recordings",
-    "import_checkpoint": "nerg_mi.api.analysis",
+    "import_checkpoint": "nerg_mi.environment.conversion",
     "import_rays": "nerg_mi.api.recordings",
     "load_field": "nerg_mi.environment.trained",
     "load_gaze": "nerg_mi.api.gaze",

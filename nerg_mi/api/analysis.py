@@ -15,7 +15,6 @@ from nerg_mi.errors import NergError
 from nerg_mi.files.values import FilePath
 from nerg_mi.rays.rays import Rays
 from nerg_mi.workflows.radiance_commands import (
-    CheckpointImportOptions,
     MeshOptions,
     PointOptions,
     SceneExportOptions,
@@ -27,7 +26,7 @@ from nerg_mi.workflows.scene_commands import BakeOptions, FilmOptions, ReportOpt
 
 from .arguments import check_output, resolve_file
 from .calls import Progress, report_progress, show_figure
-from .gaze import TrainedGazeField, list_inputs
+from .gaze import list_inputs
 from .objects import as_file, as_scene_file, build_options, copy_from_session
 from .scene import AnyEnvironment, Scene, make_scene
 from .session import display_name, is_object, session_folder
@@ -366,7 +365,7 @@ def render_film(
         return render_to_file(as_file(scene, "scene"), Path(output), resolved, reporter).path
 
 
-# ---- Fields from and to other programs, and poses of photos ----
+# ---- Fields for other programs, and poses of photos ----
 
 _EXPORTS = {
     "mesh": ("export_mesh", MeshOptions),
@@ -500,54 +499,3 @@ def export_scene(
             for item in (items if isinstance(items, (list, tuple)) else [items])
         ]
         return write(files, Path(output), resolved, reporter, names=[display_name(file) for file in files])
-
-
-def import_checkpoint(
-    file: FilePath, *, options: CheckpointImportOptions | None = None, progress: Progress = None, **overrides: Any
-) -> tuple[TrainedField[RadianceField] | None, TrainedGazeField | None]:
-    """Read a checkpoint (.pth) of torch-ngp, or of the NeRG paper's authors, without executing code in it.
-
-    Parameters
-    ----------
-    file : path
-        The checkpoint.
-    options : CheckpointImportOptions, optional
-        Base options (`nerg_mi.workflows.radiance_commands.CheckpointImportOptions`).
-    progress : bool, Reporter or None
-        None shows a progress bar in notebooks, True shows one anywhere, False none; a `Reporter` receives everything.
-    **overrides
-        Single options on top of ``options``.
-
-    Returns
-    -------
-    field : TrainedField or None
-        The radiance field, if the checkpoint has one.
-    gaze : TrainedGazeField or None
-        The gaze field, if the checkpoint has one.
-
-    Raises
-    ------
-    NergError
-        The file is not such a checkpoint.
-
-    Examples
-    --------
-    >>> import nerg_mi as nerg
-    >>> from importlib.resources import files
-    >>> field = nerg.load_field(files("nerg_mi.scenes.store") / "store.safetensors")
-    >>> try:
-    ...     nerg.import_checkpoint(folder / "nowhere.pth")
-    ... except nerg.NergError as error:
-    ...     print("nowhere.pth" in str(error))
-    True
-    """
-    from nerg_mi.workflows.export import import_checkpoint as read
-
-    path = resolve_file(file, "file")
-    with report_progress(progress) as reporter:
-        resolved = build_options(CheckpointImportOptions, "import_checkpoint", options, overrides)
-        fields = read(path, None, None, resolved, reporter)
-    return (
-        None if fields.field is None else TrainedField(fields.field, fields.origin, path.name),
-        None if fields.gaze is None else TrainedGazeField(fields.gaze, fields.origin, path.name),
-    )

@@ -17,10 +17,10 @@ from types import SimpleNamespace
 from typing import Any, get_type_hints
 
 from nerg_mi.errors import NergError, parameter
-from nerg_mi.options import MAIN, TRAINING, cpu_threads, llvm_variant, option
+from nerg_mi.options import MAIN, OUTPUT, TRAINING, cpu_threads, llvm_variant, option
 from nerg_mi.progress import Reporter
 from nerg_mi.ranges import RANGE, find_ranges
-from nerg_mi.workflows.base import Command, argument, import_function, out, select_backend
+from nerg_mi.workflows.base import Command, argument, extra, import_function, out, select_backend
 
 from .table import Row
 
@@ -44,12 +44,15 @@ def make_command(row: Row) -> Command:
     arguments = {
         name: argument(texts[name], kinds[name], required=parameters[name].default is _EMPTY) for name in row.arguments
     }
-    writes = "output" in parameters
+    writes, outputs = "output" in parameters, dict[str, Any]()
     if writes:
         is_required = row.output or parameters["output"].default is _EMPTY
         arguments["output"] = out(row.output or texts["output"], default=... if is_required else None)
     elif row.output:
-        arguments["output"] = out(row.output)
+        outputs["output"] = out(row.output, default=None if row.suffices else ...)
+    for name, (help, *spellings) in row.more_outputs.items():
+        outputs[name] = extra(None, help, Path, *spellings, group=OUTPUT)
+    arguments |= outputs
     members, settings, ranges = list[Any](), dict[str, Any](), find_ranges(function)
     for name in (name for name in kinds if name not in arguments):
         default = parameters[name].default
@@ -65,11 +68,13 @@ def make_command(row: Row) -> Command:
     options = make_dataclass("Options", members, frozen=True, kw_only=True)
 
     def run(*, options: Any, reporter: Reporter, **values: Any) -> None:
-        output = values.pop("output") if row.output and not writes else None
-        if output is not None:
+        paths = {name: path for name in outputs if (path := values.pop(name)) is not None}
+        if row.suffices and not paths:
+            raise NergError(f"no output is given: add {' or '.join(parameter(name, 'FILE') for name in outputs)}")
+        for path in paths.values():
             from nerg_mi.files.atomic import check_writable  # which imports NumPy
 
-            check_writable(output, *row.suffixes)
+            check_writable(path, *row.suffixes)
         if row.computes:
             select_backend(options.mode, options.threads)
         chosen = {name: getattr(options, name) for name in kinds if hasattr(options, name)}
@@ -77,14 +82,16 @@ def make_command(row: Row) -> Command:
             shown = [f.name for f in fields(kind) if hasattr(options, f.name)]
             chosen[name] = kind(**{field: getattr(options, field) for field in shown})
         for name, files in row.alternatives.items():
-            paths = {parameter(file): path for file in files if (path := getattr(options, file)) is not None}
-            if len(paths) > 1:
-                raise NergError(f"{' and '.join(paths)} are alternatives: give one of them")
-            chosen[name] = next(iter(paths.values()), None)
+            choices = {parameter(file): path for file in files if (path := getattr(options, file)) is not None}
+            if len(choices) > 1:
+                raise NergError(f"{' and '.join(choices)} are alternatives: give one of them")
+            chosen[name] = next(iter(choices.values()), None)
+        chosen |= {name: name in paths for name in row.more_outputs if name in kinds}
         result = import_function(row.function)(**values, **chosen, progress=reporter)
-        if output is not None:
-            result.save(output)
-            reporter.message(f"wrote {output} ({output.stat().st_size / 1e6:.1f} MB)")
+        if paths:
+            result.save(paths.get("output"), **{name: paths[name] for name in row.more_outputs if name in paths})
+        for path in paths.values():
+            reporter.message(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB)")
 
     summary, _, more = (inspect.getdoc(function) or "").partition("\n\nParameters\n")[0].partition("\n\n")
     return Command(row.name, run, " ".join(summary.split()), " ".join(more.split()), options, (), None, arguments)

@@ -16,8 +16,11 @@ class Row:
 
     ``arguments`` are the parameters without a flag, in order. ``output`` is the help of ``--output``, to which the
     result is saved, and ``suffixes`` are those of this file; a function that writes during its work has a parameter
-    ``output``, which the command requires if it has this help. ``alternatives`` are options for files of different
-    kinds, with their help, of which at most one is given, by the parameter that takes them. A command that
+    ``output``, which the command requires if it has this help. ``more_outputs`` are optional files that the method
+    ``save`` takes as well, by keyword: their help, and their spellings if they differ from the keyword. A parameter of
+    the function with the same name tells it whether the file is written. Only one of the outputs is needed if any of
+    them ``suffices``. ``alternatives`` are options for files of different kinds, with their help, of which at most one
+    is given, by the parameter that takes them. A command that
     ``computes`` has ``--mode``.
     """
 
@@ -27,6 +30,8 @@ class Row:
     arguments: tuple[str, ...] = ()
     output: str = ""
     suffixes: tuple[str, ...] = ()
+    more_outputs: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    suffices: bool = False
     computes: bool = True
     alternatives: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
 
@@ -51,6 +56,16 @@ TABLE = (
         "Estimate the camera poses of photos or video frames.",
         ("pictures",),
         computes=False,
+    ),
+    Row(
+        "import",
+        "nerg_mi.environment.conversion:import_checkpoint",
+        "Convert checkpoints of torch-ngp and of the NeRG paper's authors.",
+        ("file",),
+        "Radiance field to write (.safetensors).",
+        (".safetensors",),
+        {"gaze": ("Gaze field to write (.safetensors).", "-g", "--gaze")},
+        suffices=True,
     ),
     Row(
         "refine",

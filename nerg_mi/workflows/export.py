@@ -1,4 +1,4 @@
-"""Export of fields to meshes, points, splats, volumes and checkpoints of other programs, and import of these."""
+"""Export of fields to meshes, points, splats, volumes and checkpoints of other programs."""
 
 from __future__ import annotations
 
@@ -8,11 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from nerg_mi.errors import NergError, parameter
-from nerg_mi.fields.gaze_base import AnyGazeField
-from nerg_mi.fields.occupancy import refine_occupancy
 from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.files.atomic import check_writable
-from nerg_mi.formats.fields import load_radiance, save_gaze, save_radiance
+from nerg_mi.formats.fields import load_radiance
 from nerg_mi.formats.splats import make_splats, write_ply_splats
 from nerg_mi.formats.surfaces import (
     Surface,
@@ -23,113 +21,11 @@ from nerg_mi.formats.surfaces import (
     write_ply,
     write_volume,
 )
-from nerg_mi.formats.torch_ngp import (
-    ImportOptions,
-    is_nerg_checkpoint,
-    open_checkpoint,
-    read_nerg,
-    read_torch_ngp,
-    write_torch_ngp,
-)
+from nerg_mi.formats.torch_ngp import write_torch_ngp
 from nerg_mi.progress import SILENT, Reporter
 
 from .base import argument, out, select_backend
-from .radiance_commands import (
-    CheckpointImportOptions,
-    MeshOptions,
-    PointOptions,
-    SplatOptions,
-    TorchNgpOptions,
-    VolumeOptions,
-)
-
-# ---- Import of fields of other programs ----
-
-
-@dataclass(frozen=True)
-class ImportedFields:
-    """Imported fields.
-
-    ``field`` and ``gaze`` are None if the checkpoint has none; ``origin`` is their provenance (JSON); ``files`` were
-    written.
-    """
-
-    field: RadianceField | None
-    gaze: AnyGazeField | None
-    origin: dict
-    files: list[Path]
-
-
-def import_checkpoint(
-    file: str | Path,
-    output: str | Path | None = None,
-    gaze: str | Path | None = None,
-    options: CheckpointImportOptions | None = None,
-    reporter: Reporter = SILENT,
-) -> ImportedFields:
-    """Read a checkpoint (.pth) of torch-ngp, or of the NeRG paper's authors, without executing code in it.
-
-    ``output`` and ``gaze`` are files for the radiance and the gaze field (.safetensors); None writes none. Raises
-    `NergError` if the checkpoint lacks a field that is to be written, and for errors that the user can correct.
-    """
-    options = options or CheckpointImportOptions()
-    output, gaze = (None if path is None else Path(path) for path in (output, gaze))
-    for path in (output, gaze):
-        if path is not None:
-            check_writable(path, ".safetensors")
-    settings = ImportOptions(options.color_space, options.finest_resolution, options.bg_radius)
-    reporter.progress(0.0, f"converting {Path(file).name}")
-    ns = select_backend(options.mode)
-    if is_nerg_checkpoint(open_checkpoint(file)[1]):
-        field, attention, origin = read_nerg(file, ns, options.ema, settings)
-    else:
-        if gaze is not None:
-            raise NergError(f'"{file}" contains no gaze field: leave out {parameter("gaze")}')
-        (field, origin), attention = read_torch_ngp(file, ns, options.ema, settings), None
-    if field is not None:
-        field.occupancy = refine_occupancy(field) or field.occupancy
-    if output is not None:
-        if field is None:
-            raise NergError(
-                f'"{file}" contains a gaze field but no NeRF: write it with {parameter("gaze")} alone, without '
-                f"{parameter('output')}, and import the NeRF from its own file"
-            )
-        save_radiance(field, output, origin, options.half)
-        reporter.message(_describe_field(field, origin))
-        _report_written(output, reporter)
-    if attention is not None and gaze is not None:
-        save_gaze(attention, gaze, origin, options.half)
-        config = attention.config
-        reporter.message(f"gaze: {config.variant}, trunk {config.trunk}, bound {attention.box.side / 2:g}")
-        _report_written(gaze, reporter)
-    elif attention is not None:
-        reporter.message(f'"{file}" also contains a gaze field: write it with {parameter("gaze", "NAME.safetensors")}')
-    return ImportedFields(field, attention, origin, [path for path in (output, gaze) if path is not None])
-
-
-def import_to_files(
-    file: Path, output: Path | None, gaze: Path | None, options: CheckpointImportOptions, reporter: Reporter
-) -> None:
-    """Call `import_checkpoint` with at least one output file."""
-    if output is None and gaze is None:
-        raise NergError(
-            f"no output is given: add {parameter('output', 'FIELD.safetensors')}, "
-            f"{parameter('gaze', 'GAZE.safetensors')}, or both"
-        )
-    import_checkpoint(file, output, gaze, options, reporter)
-
-
-def _describe_field(field: RadianceField, origin: dict) -> str:
-    cells = "no occupancy grid (marching evaluates all of space)"
-    if field.occupancy is not None:
-        cells = f"{100 * field.occupancy.occupied_fraction:.1f} % of its box occupied"
-    behind = "" if field.background is None else f", background of radius {field.background.config.radius:g}"
-    return f"radiance: bound {field.box.side / 2:g}, {origin['weights']} weights, {cells}{behind}"
-
-
-def _report_written(path: Path, reporter: Reporter) -> None:
-    reporter.message(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB)")
-
+from .radiance_commands import MeshOptions, PointOptions, SplatOptions, TorchNgpOptions, VolumeOptions
 
 # ---- Export ----
 #

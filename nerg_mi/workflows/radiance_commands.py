@@ -1,6 +1,5 @@
 """``nerg train radiance``: Train a radiance field on posed photos and report the error on held-out views.
 ``nerg eval radiance``: Score a radiance field on held-out views: PSNR, SSIM and, where it is known, depth error.
-``nerg import``: Convert checkpoints of torch-ngp and of the NeRG paper's authors.
 ``nerg export mesh``: Extract a mesh with vertex colours by marching cubes (.ply, .glb).
 ``nerg export points``: Sample surface points with normals and colours (.ply, .glb).
 ``nerg export splats``: Place Gaussian splats on the surface (.ply), for splat viewers and the volume "splats".
@@ -38,7 +37,7 @@ from nerg_mi.options import (
 from nerg_mi.ranges import LENGTHS, POSITIVE_VALUES, SECONDS, SPP, Range, ValidatedDataclass
 from nerg_mi.train.radiance_settings import RadianceSettings
 
-from .base import argument, declare, extra, out
+from .base import argument, declare, out
 
 # ---- From photos to a field ----
 
@@ -180,36 +179,7 @@ declare(
 )
 
 
-# ---- Conversion from and to other programs ----
-
-
-@dataclass(frozen=True, kw_only=True)
-class CheckpointImportOptions(ValidatedDataclass):
-    """Options of ``nerg import``: what a checkpoint does not store, and how fields are written."""
-
-    ema: bool | None = option(
-        None,
-        "Import the exponential moving averages of the weights, or the last weights.  [default: averages if there are "
-        "any]",
-        "--ema/--no-ema",
-        group=INPUT,
-    )
-    color_space: str = option("srgb", "Value of --color_space in the original training: srgb or linear.", group=INPUT)
-    bg_radius: float | None = option(
-        None,
-        "Value of --bg_radius in the original training, needed if there is a background network; 0 leaves the network "
-        "out.",
-        within=Range(0, 10**6),
-        group=INPUT,
-    )
-    finest_resolution: int | None = option(
-        None,
-        "Finest resolution of the hash grid in cells.  [default: 2048 times the bound]",
-        within=Range(2, 1 << 24),
-        group=INPUT,
-    )
-    half: bool = option(False, "Store the weights in half precision (fp16).", group=OUTPUT)
-    mode: str = llvm_variant()
+# ---- Conversion to other programs ----
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -342,17 +312,6 @@ declare(
         metavar="FILES",
     ),
     output=out("File to write (.rrd, .usdc, .usda or .usd)."),
-)
-
-declare(
-    "import",
-    "nerg_mi.workflows.export:import_to_files",
-    "Convert a checkpoint to radiance and gaze fields, for the volumes `nerf` and `gazefield`. No code in the file is "
-    "executed.",
-    options=CheckpointImportOptions,
-    file=argument("Checkpoint (.pth) of torch-ngp, or of the NeRG paper's authors."),
-    output=out("Radiance field to write (.safetensors).", default=None),
-    gaze=extra(None, "Gaze field to write (.safetensors).", Path, "-g", "--gaze", group=OUTPUT),
 )
 
 _FIELD = argument("Radiance field (.safetensors).")

@@ -23,7 +23,7 @@ from nerg_mi.cli.table import ROWS, Row
 from nerg_mi.errors import NergError
 from nerg_mi.files.values import FilePath
 from nerg_mi.options import option, parse_numbers
-from nerg_mi.progress import Progress
+from nerg_mi.progress import Progress, Reporter
 from nerg_mi.ranges import KAPPAS, Range, ValidatedDataclass, check_ranges, setting
 from nerg_mi.rays.readers.base import list_options
 from nerg_mi.rays.readers.registry import collect_shared_options, get_reader, list_preset_names
@@ -265,6 +265,51 @@ def test_a_function_with_an_output_writes_during_its_work(monkeypatch, tmp_path,
     with pytest.raises(SystemExit) as end:
         nerg_mi.cli.main(["record", "a"])
     assert end.value.code == 2
+
+
+class Sheets:
+    def save(self, path=None, parts=None):
+        for file in filter(None, (path, parts)):
+            Path(file).touch()
+
+
+def write_down(*, parts: bool = False, progress: Progress = None):
+    """Write music down.
+
+    Parameters
+    ----------
+    parts : bool
+        Whether each instrument has a sheet.
+    """
+    assert isinstance(progress, Reporter)
+    progress.message(f"parts: {parts}")
+    return Sheets()
+
+
+def test_a_command_writes_further_files(monkeypatch, tmp_path, capsys):
+    """An output that is not given is not written, and the function is told so."""
+    row = Row("score", f"{__name__}:write_down", "", output="Score (.txt).", suffixes=(".txt",), computes=False)
+    parts = {"parts": ("Parts (.txt).", "-p", "--parts")}
+
+    def nerg(row, *line):
+        monkeypatch.setitem(ROWS, "score", row)
+        monkeypatch.setattr(building, "TABLE", (row,))
+        with pytest.raises(SystemExit) as end:
+            nerg_mi.cli.main(["score", *map(str, line)])
+        files = {path.name for path in tmp_path.iterdir()}
+        for path in tmp_path.iterdir():
+            path.unlink()
+        return end.value.code, files, capsys.readouterr().out.split("\n")[0]
+
+    output, more = ("-o", tmp_path / "a.txt"), ("-p", tmp_path / "b.txt")
+    row = replace(row, more_outputs=parts)
+    assert nerg(row, *output) == (0, {"a.txt"}, "parts: False")
+    assert nerg(row, *output, *more) == (0, {"a.txt", "b.txt"}, "parts: True")
+    assert nerg(row, *more) == (2, set(), "")
+    assert nerg(row, *output, "-p", tmp_path / "b.png")[:2] == (1, set())
+    row = replace(row, suffices=True)
+    assert nerg(row, *more)[:2] == (0, {"b.txt"})
+    assert nerg(row)[:2] == (1, set())
 
 
 def test_a_command_line_without_a_command_is_refused(monkeypatch, tmp_path, capsys):

@@ -14,6 +14,7 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from nerg_mi.environment.conversion import ImportedFields, import_checkpoint
 from nerg_mi.environment.environment import Environment
 from nerg_mi.environment.trained import TrainedField, load_field
 from nerg_mi.errors import NergError
@@ -43,9 +44,8 @@ from nerg_mi.workflows.export import (
     export_points,
     export_splats,
     export_volume,
-    import_checkpoint,
 )
-from nerg_mi.workflows.radiance_commands import CheckpointImportOptions, RadianceOptions, RadianceScoreOptions
+from nerg_mi.workflows.radiance_commands import RadianceOptions, RadianceScoreOptions
 from nerg_mi.workflows.train_radiance import evaluate_radiance, train_radiance
 from tests.formats.test_torch_ngp import save_nerg as save
 from tests.formats.test_torch_ngp import small_gaze, small_state
@@ -153,19 +153,19 @@ def test_training_views_are_refused_as_held_out_views(cube):
 # ---- Imported checkpoints of other programs, with and without files ----
 
 
-def test_import_without_an_output_returns_fields(torch, tmp_path):
+def test_imported_fields_are_saved_by_kind(torch, tmp_path):
     path, recorder = save(tmp_path / "nerg.pth", small_gaze(), nerf=small_state()), Recorder()
-    result = import_checkpoint(path, reporter=recorder)
-    assert result.field is not None and result.gaze.config.variant == "emit_capture" and result.files == []
-    assert [p.name for p in tmp_path.iterdir()] == ["nerg.pth"]
-    assert recorder.messages == [f'"{path}" also contains a gaze field: write it with gaze=NAME.safetensors']
-
-
-def test_import_returns_files_in_order(torch, tmp_path):
-    path = save(tmp_path / "nerg.pth", small_gaze(), nerf=small_state())
-    outputs = tmp_path / "f.safetensors", tmp_path / "g.safetensors"
-    result = import_checkpoint(path, *outputs, CheckpointImportOptions(half=True))
-    assert tuple(result.files) == outputs and all(p.is_file() for p in outputs)
+    field, gaze = result = import_checkpoint(path, half=True, progress=recorder)
+    assert field.kind == "radiance" and gaze.kind == "gaze" and gaze.network.config.variant == "emit_capture"
+    assert [p.name for p in tmp_path.iterdir()] == ["nerg.pth"] and len(recorder.messages) == 2
+    result.save(tmp_path / "f.safetensors", tmp_path / "g.safetensors")
+    assert load_field(tmp_path / "f.safetensors").half and (tmp_path / "g.safetensors").is_file()
+    assert field.provenance == load_field(tmp_path / "f.safetensors").provenance
+    for only in (ImportedFields(field, None), ImportedFields(None, gaze)):
+        with pytest.raises(NergError) as error:
+            only.save(tmp_path / "a.safetensors", tmp_path / "b.safetensors")
+        assert "gaze" in error.value.parameters
+    assert not (tmp_path / "a.safetensors").exists() and not (tmp_path / "b.safetensors").exists()
 
 
 # ---- Exports from a file and from a loaded field ----
