@@ -267,6 +267,17 @@ def test_solid_angles_of_octant_and_distant_triangles():
     assert solid_angles(np.array([[(1.0, 0, 0), (2, 0, 0), (1, 1, 0)]]))[0] == 0
 
 
+@pytest.mark.parametrize("angle", [0.2, 1.0])
+def test_edges_subtend_the_angle_from_the_nearest_point(angle):
+    """Of the bounding sphere of their piece, which is nearer than its centre."""
+    eye = np.array([0.5, 0.4, 0.1])
+    corners = subdivide_faces(PIECES_ROOM, eye, angle).relative
+    middle = corners.mean(axis=1, keepdims=True)
+    nearest = np.linalg.norm(middle[:, 0], axis=1) - np.linalg.norm(corners - middle, axis=2).max(axis=1)
+    edge = np.linalg.norm(corners - corners[:, [1, 2, 0]], axis=2).max(axis=1)
+    assert np.all(edge <= angle * nearest * (1 + 1e-9))
+
+
 def test_subdivision_ends_for_observer_on_a_face():
     sheet = joined((np.array([(-1.0, -1, 0), (2, -1, 0), (-1, 2, 0)]), np.array([(0, 1, 2)])))
     result = subdivide_faces(sheet, np.zeros(3), 0.5)
