@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 from uuid import uuid4
 
 from nerg_mi.environment.trained import TrainedField
-from nerg_mi.files.values import FilePath
+from nerg_mi.errors import NergError
+from nerg_mi.files.values import FilePath, to_path
 from nerg_mi.interruption import TrainingInterrupted
-from nerg_mi.rays.rays import Rays
-from nerg_mi.workflows.gaze_commands import GazeOptions, PriorOptions
+from nerg_mi.progress import open_reporter
+from nerg_mi.ranges import RAYS, SEEDS, check_ranges
+from nerg_mi.rays.dataset import hash_rays, load_rays
+from nerg_mi.rays.rays import Rays, merge_tracking
+from nerg_mi.rendering.scene import get_array_module
+from nerg_mi.train.gaze_log_density import ELEVATION_KAPPA, ELEVATION_PRIOR, make_elevation_prior
+from nerg_mi.workflows.gaze_commands import GazeOptions
 from nerg_mi.workflows.radiance_commands import RadianceOptions
 
 from .arguments import check_output, resolve_file
@@ -24,7 +31,7 @@ from .session import session_folder
 
 if TYPE_CHECKING:
     from nerg_mi.fields.radiance import RadianceField
-    from nerg_mi.workflows.train_gaze import GazeResult, PriorResult
+    from nerg_mi.workflows.train_gaze import GazeResult
 
 
 def train_radiance(
@@ -146,29 +153,30 @@ def train_gaze(
             )
 
 
+@check_ranges
 def train_prior(
     rays: Rays | FilePath | Sequence[Rays | FilePath],
-    output: FilePath | None = None,
     *,
-    options: PriorOptions | None = None,
+    max_samples: Annotated[int, RAYS] = 10_000_000,
+    seed: Annotated[int, SEEDS] = 0,
     progress: Progress = None,
-    **overrides: Any,
 ) -> TrainedGazeField:
-    """Fit a gaze field for an environment without recordings: the distribution of gaze elevations in other
-    environments.
+    """Fit an elevation prior on recordings in other scenes, for a scene without tracking.
+
+    The prior is the distribution of gaze elevation over participants, the same at every position. It is valid in any
+    scene whose z axis points up. docs/explanation/accuracy.md compares it with fields trained on tracking.
 
     Parameters
     ----------
     rays : Rays, path, or sequence of these
-        Recordings, one item per environment. Environments have equal weights.
-    output : path, optional
-        Checkpoint to write (.safetensors).
-    options : PriorOptions, optional
-        Base options (`nerg_mi.workflows.gaze_commands.PriorOptions`).
+        Rays files (.npz or .parquet) or datasets (.rays), one for each scene. Scenes have equal weights, and so have
+        participants within a scene.
+    max_samples : int
+        Maximum number of samples read from a dataset; larger datasets are subsampled uniformly with ``seed``.
+    seed : int
+        Seed of the subsampling.
     progress : bool, Reporter or None
-        None shows a progress bar in notebooks, True shows one anywhere, False none; a `Reporter` receives everything.
-    **overrides
-        Single options on top of ``options``, such as ``seed=1``.
+        Progress and messages (`nerg_mi.progress.Progress`).
 
     Returns
     -------
@@ -178,7 +186,7 @@ def train_prior(
     Raises
     ------
     NergError
-        An option or a file is invalid.
+        There are no rays, or an argument is invalid.
 
     Examples
     --------
@@ -187,15 +195,33 @@ def train_prior(
     >>> prior.kind, len(prior.provenance["places"])
     ('gaze', 1)
     """
-    from nerg_mi.workflows import train_gaze as gaze
-
-    check_output(output)
-    environments = [rays] if isinstance(rays, (str, os.PathLike, Rays)) else rays
-    with report_progress(progress) as reporter:
-        resolved = build_options(PriorOptions, "train_prior", options, overrides)
-        inputs = [item if isinstance(item, Rays) else resolve_file(item, "rays") for item in environments]
-        result = gaze.learn_prior(inputs, output, resolved, reporter)
-    return _make_gaze_field(result, output, None)
+    sources = [rays] if isinstance(rays, (str, os.PathLike, Rays)) else rays
+    if not sources:
+        raise NergError("a prior needs rays of other scenes: give at least one file")
+    recordings, files = [], []
+    with open_reporter(progress) as reporter:
+        for k, source in enumerate(sources):
+            reporter.progress(k / len(sources), "reading rays")
+            entry = {} if isinstance(source, Rays) else {"file": to_path(source).name, "sha256": hash_rays(source)}
+            data = source if isinstance(source, Rays) else load_rays(source, max_samples, seed)
+            recordings.append(data)
+            files.append({**entry, "rays": len(data), "persons": len(data.persons), "tracking": data.tracking})
+        if empty := [str(k + 1) for k, data in enumerate(recordings) if not len(data)]:
+            raise NergError(f"there are no rays in file {', '.join(empty)} of those given; leave it out")
+        field = make_elevation_prior(recordings, get_array_module())
+        participants = sum(entry["persons"] for entry in files)
+        reporter.message(
+            f"distribution of gaze elevation of {participants} participants in {len(files)} "
+            f"scene{'' if len(files) == 1 else 's'}, independent of position"
+        )
+    provenance = {
+        "recipe": ELEVATION_PRIOR,
+        "kappa": ELEVATION_KAPPA,
+        "places": files,
+        "tracking": merge_tracking(data.tracking for data in recordings),
+        "made": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+    }
+    return TrainedGazeField(field, provenance)
 
 
 @contextmanager
@@ -209,7 +235,7 @@ def _converting_interrupts(make: Callable[[TrainingInterrupted], object]) -> Ite
 
 
 def _make_gaze_field(
-    result: GazeResult | PriorResult | TrainingInterrupted, output: FilePath | None, geometry_file: Path | None
+    result: GazeResult | TrainingInterrupted, output: FilePath | None, geometry_file: Path | None
 ) -> TrainedGazeField:
     return TrainedGazeField(result.field, result.provenance, *_locate(output), geometry_file)
 

@@ -63,7 +63,9 @@ def make_command(row: Row) -> Command:
             settings[name] = type(default)
             members += [(f.name, f.type, _repeat(f)) for f in fields(default) if "help" in f.metadata]
         else:
-            members.append((name, kinds[name], option(default, texts[name], within=ranges.get(name), group=MAIN)))
+            names = row.spellings.get(name, ())
+            made = option(default, texts[name], *names, within=ranges.get(name), group=MAIN)
+            members.append((name, kinds[name], made))
     members += [(name, *declared) for name, declared in _DEVICE.items() if row.computes]
     options = make_dataclass("Options", members, frozen=True, kw_only=True)
 

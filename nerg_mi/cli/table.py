@@ -20,8 +20,8 @@ class Row:
     ``save`` takes as well, by keyword: their help, and their spellings if they differ from the keyword. A parameter of
     the function with the same name tells it whether the file is written. Only one of the outputs is needed if any of
     them ``suffices``. ``alternatives`` are options for files of different kinds, with their help, of which at most one
-    is given, by the parameter that takes them. A command that
-    ``computes`` has ``--mode``.
+    is given, by the parameter that takes them. A command that ``computes`` has ``--mode``. ``spellings`` are those of
+    options that have more than their name.
     """
 
     name: str
@@ -34,9 +34,19 @@ class Row:
     suffices: bool = False
     computes: bool = True
     alternatives: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    spellings: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
 
 TABLE = (
+    Row(
+        "train prior",
+        "nerg_mi.api.training:train_prior",
+        "Fit an elevation prior on recordings in other scenes, for a scene without tracking.",
+        ("rays",),
+        "Gaze field to write (.safetensors).",
+        (".safetensors",),
+        spellings={"seed": ("-s", "--seed")},
+    ),
     Row(
         "align",
         "nerg_mi.alignment.align:align",

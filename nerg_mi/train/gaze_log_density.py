@@ -181,6 +181,7 @@ def log_mean_exp(logit: Any, count: int) -> Any:
 # distance or incidence fitted in other environments predict gaze worse.
 
 ELEVATION_KAPPA = 30.0  # Concentration of the kernel of a ray
+ELEVATION_PRIOR = "prior"  # Recipe in the provenance of such a field
 # Bins of the sine of the elevation, and directions of the quadrature that normalises the table.
 _NUM_BINS, _QUADRATURE_DIRECTIONS = 2048, 1 << 16
 

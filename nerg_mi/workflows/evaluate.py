@@ -52,12 +52,13 @@ from nerg_mi.rays.rays import TRACKING, Rays
 from nerg_mi.tasks.task import FOLDER_SUFFIX, RENDER_LIBRARIES, Part, Plan
 from nerg_mi.threads import set_thread_count
 from nerg_mi.train.gaze_data import find_hit_points
+from nerg_mi.train.gaze_log_density import ELEVATION_PRIOR
 from nerg_mi.train.geometry_files import check_geometry, geometry_kind, load_training_geometry
 
 from .base import select_backend
 from .gaze_commands import FoldOptions, GazeEvaluationOptions, GazeOptions
 from .parts import PartRunner, PlannedScene
-from .train_gaze import PRIOR, train_gaze
+from .train_gaze import train_gaze
 
 # ---- Evaluation ----
 #
@@ -294,7 +295,7 @@ def _groups(account: dict, split: str, centres: np.ndarray) -> list[str] | None:
 
 def load_training_rays(gaze: Path, training: dict, rays: Rays | str | Path) -> Rays:
     """Return the rays of the training. Raises `NergError` for others, and if none were held out."""
-    if training.get("recipe") == PRIOR:
+    if training.get("recipe") == ELEVATION_PRIOR:
         raise NergError(f'"{gaze}" is a prior from other scenes, for which no rays of this scene were held out')
     if "test" not in training:
         raise NergError(

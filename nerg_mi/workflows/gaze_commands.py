@@ -1,5 +1,4 @@
 """``nerg train gaze``: Train a gaze field on gaze rays and score it at held-out positions.
-``nerg train prior``: Fit an elevation prior on recordings in other scenes, for a scene without tracking.
 ``nerg eval gaze``: Score a gaze field on held-out data and compare it with baselines.
 ``nerg eval next``: Predict the next look from the last looks and a gaze field; score it on held-out participants.
 ``nerg eval folds``: Cross-validate a gaze field: train and score it several times on different splits.
@@ -198,32 +197,6 @@ declare(
         "Rays file (.npz or .parquet) or dataset (.rays), as nerg rays import writes it. Not needed with --views.",
         required=False,
     ),
-    output=out("Gaze field to write (.safetensors)."),
-)
-
-
-@dataclass(frozen=True, kw_only=True)
-class PriorOptions(ValidatedDataclass):
-    """Options of ``nerg train prior``."""
-
-    max_samples: int = option(
-        10_000_000,
-        "Maximum number of samples read from a dataset; larger datasets are subsampled uniformly with --seed.",
-        within=RAYS,
-        group=INPUT,
-    )
-    seed: int = option(0, "Seed of the subsampling.", "-s", "--seed", within=SEEDS, group=INPUT)
-    mode: str = llvm_variant()
-
-
-declare(
-    "train prior",
-    "nerg_mi.workflows.train_gaze:learn_prior",
-    more="The prior is the distribution of gaze elevation over participants, the same at every position. It is "
-    "valid in any scene whose z axis points up. docs/explanation/accuracy.md compares it with fields trained on "
-    "tracking.",
-    options=PriorOptions,
-    rays=argument("Rays files (.npz or .parquet) or datasets (.rays), one for each scene.", list[Path]),
     output=out("Gaze field to write (.safetensors)."),
 )
 

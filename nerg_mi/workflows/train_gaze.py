@@ -1,9 +1,7 @@
-"""Training of a gaze field on rays, and of an elevation prior for scenes without tracking."""
+"""Training of a gaze field on rays."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -24,19 +22,18 @@ from nerg_mi.options import explicit_settings
 from nerg_mi.photos.salience import SalienceSet, open_salience
 from nerg_mi.progress import SILENT, Reporter
 from nerg_mi.rays.dataset import hash_rays, is_dataset, load_rays
-from nerg_mi.rays.rays import Rays, merge_tracking
+from nerg_mi.rays.rays import Rays
 from nerg_mi.train import gaze_run
 from nerg_mi.train.gaze_data import Supervision, TargetRequirements, check_prior_kappa, hold_out, select_far_views
 from nerg_mi.train.gaze_ensemble import train_ensemble
 from nerg_mi.train.gaze_folds import selects_prior_weight
-from nerg_mi.train.gaze_log_density import ELEVATION_KAPPA, make_elevation_prior
 from nerg_mi.train.gaze_recipes import FieldOptions, Recipe, get_recipe
 from nerg_mi.train.gaze_settings import GazeSettings, ProbeSettings
 from nerg_mi.train.gaze_trainer import GazePlan, GazeProgress, StateSettings
 from nerg_mi.train.geometry_files import check_geometry, geometry_kind, make_geometry
 
 from .base import select_backend
-from .gaze_commands import GazeOptions, PriorOptions
+from .gaze_commands import GazeOptions
 
 # ---- Training of a gaze field ----
 
@@ -444,67 +441,3 @@ def _describe_weights(selection: dict) -> str:
         f"{prior} and {100 * selection['hits_weight']:.0f} % of the re-aimed hits of observers nearby "
         f"(bandwidth {selection['hits_bandwidth']:g} m, kappa {selection['hits_kappa']:g})"
     )
-
-
-# ---- A gaze field for a scene without tracking, from recordings in other scenes ----
-
-
-PRIOR = "prior"
-"""Recipe in the provenance of such a field."""
-
-
-@dataclass(frozen=True)
-class PriorResult:
-    """``field``; its ``provenance`` (JSON); its checkpoint ``output``, or None."""
-
-    field: AnyGazeField
-    provenance: dict
-    output: Path | None
-
-
-def learn_prior(
-    rays: Rays | str | Path | Sequence[Rays | str | Path],
-    output: str | Path | None = None,
-    options: PriorOptions | None = None,
-    reporter: Reporter = SILENT,
-) -> PriorResult:
-    """Fit an elevation prior: a gaze field for any scene whose z axis points up.
-
-    The prior is the distribution of gaze elevation in ``rays``, their files (.npz or .parquet) or datasets, one for
-    each scene. Scenes have equal weights, and so have participants within a scene. It does not depend on the position
-    of the observer. It is written to ``output`` (.safetensors) if that is given. Raises `NergError` for errors that the
-    user can correct.
-    """
-    options, output = options or PriorOptions(), None if output is None else Path(output)
-    rays = [rays] if isinstance(rays, (Rays, str, Path)) else rays
-    if not rays:
-        raise NergError("a prior needs rays of other scenes: give at least one file")
-    if output is not None:
-        check_writable(output, ".safetensors")
-    ns = select_backend(options.mode)
-    recordings, files = [], []
-    for k, source in enumerate(rays):
-        reporter.progress(k / len(rays), "reading rays")
-        data = source if isinstance(source, Rays) else load_rays(source, options.max_samples, options.seed)
-        file_entry = {} if isinstance(source, Rays) else {"file": Path(source).name, "sha256": hash_rays(source)}
-        recordings.append(data)
-        files.append({**file_entry, "rays": len(data), "persons": len(data.persons), "tracking": data.tracking})
-    if empty := [str(k + 1) for k, data in enumerate(recordings) if not len(data)]:
-        raise NergError(f"there are no rays in file {', '.join(empty)} of those given; leave it out")
-    field = make_elevation_prior(recordings, ns)
-    provenance = {
-        "recipe": PRIOR,
-        "kappa": ELEVATION_KAPPA,
-        "places": files,
-        "tracking": merge_tracking(data.tracking for data in recordings),
-        "made": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-    }
-    if output is not None:
-        save_gaze(field, output, provenance)
-        people = sum(entry["persons"] for entry in files)
-        scene_count = f"{len(files)} scene{'' if len(files) == 1 else 's'}"
-        reporter.message(
-            f"wrote {output}: distribution of gaze elevation of {people} participants in {scene_count}, independent of "
-            "position"
-        )
-    return PriorResult(field, provenance, output)

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.alignment.check import read_similarity
+from nerg_mi.api.training import train_prior
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation.gaze import SCORES
 from nerg_mi.evaluation.gaze_report import read_results
@@ -32,7 +33,7 @@ from nerg_mi.workflows.evaluate import SCORED, evaluate_folds, evaluate_gaze
 from nerg_mi.workflows.gaze_commands import FoldOptions, GazeEvaluationOptions, GazeOptions, NextLookOptions
 from nerg_mi.workflows.next_look import evaluate_next_look, make_ray_distance
 from nerg_mi.workflows.parts import account_for_store
-from nerg_mi.workflows.train_gaze import learn_prior, train_gaze
+from nerg_mi.workflows.train_gaze import train_gaze
 from tests.evaluation.test_gaze import crowd
 from tests.notes import find_wrong_notes
 from tests.plugins import fields
@@ -342,12 +343,13 @@ def test_a_prior_checkpoint_is_the_density_of_other_scenes(tmp_path, rgb):
     for k, rays in enumerate(places):
         rays.save(tmp_path / f"{k}.npz")
     path = tmp_path / "prior.safetensors"
-    result = learn_prior([tmp_path / "0.npz", tmp_path / "1.npz"], path)
+    result = train_prior([tmp_path / "0.npz", tmp_path / "1.npz"])
+    result.save(path)
     assert [(p["file"], p["rays"], p["persons"]) for p in result.provenance["places"]] == [
         ("0.npz", 200, 2),
         ("1.npz", 200, 2),
     ]
-    field, metadata = load_gaze(path, result.field.ns)
+    field, metadata = load_gaze(path, result.network.ns)
     assert metadata["provenance"] == result.provenance
     ns, sine = field.ns, np.array([-0.9, -0.56, 0.0, 0.2, 0.8])
     r = ns.Array3f(np.stack([np.sqrt(1 - sine**2), 0 * sine, sine]).astype(np.float32))
@@ -356,22 +358,22 @@ def test_a_prior_checkpoint_is_the_density_of_other_scenes(tmp_path, rgb):
     np.testing.assert_allclose(gaze, compute_elevation_density(places, sine), atol=0.006)
     with pytest.raises(NergError, match="is a prior from other scenes, for which no rays"):
         evaluate_gaze(path, places[0])
-    assert learn_prior(tmp_path / "1.npz").provenance["places"] == result.provenance["places"][1:]
+    assert train_prior(tmp_path / "1.npz").provenance["places"] == result.provenance["places"][1:]
     # Rays in memory are accepted.
-    same = learn_prior([places[0], places[1].with_tracking("head")])
+    same = train_prior([places[0], places[1].with_tracking("head")])
     assert same.provenance["tracking"] == "mixed" and result.provenance["tracking"] == "unknown"
-    assert same.output is None and "file" not in same.provenance["places"][0]
-    np.testing.assert_array_equal(np.array(same.field.prior.array), np.array(field.prior.array))
+    assert same.path is None and "file" not in same.provenance["places"][0]
+    np.testing.assert_array_equal(np.array(same.network.prior.array), np.array(field.prior.array))
 
 
 def test_wrong_prior_inputs_are_refused(tmp_path):
     with pytest.raises(NergError, match="at least one file"):
-        learn_prior([])
+        train_prior([])
     with pytest.raises(NergError, match="safetensors"):
-        learn_prior([looking(0.0)], tmp_path / "prior.npz")
+        train_prior([looking(0.0)]).save(tmp_path / "prior.npz")
     none = looking(0.0).select(np.zeros(200, bool))
     with pytest.raises(NergError, match="of those given; leave it out"):
-        learn_prior([looking(0.0), none])
+        train_prior([looking(0.0), none])
 
 
 # ---- Geometries of jobs: one of each kind, opened again for an evaluation, and alignments from files ----

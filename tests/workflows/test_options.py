@@ -28,7 +28,7 @@ from nerg_mi.train.gaze_settings import ProbeSettings
 from nerg_mi.workflows import evaluate
 from nerg_mi.workflows.base import select_backend, versions
 from nerg_mi.workflows.evaluate import fold_options
-from nerg_mi.workflows.gaze_commands import FoldOptions, GazeEvaluationOptions, GazeOptions, PriorOptions
+from nerg_mi.workflows.gaze_commands import FoldOptions, GazeEvaluationOptions, GazeOptions
 from nerg_mi.workflows.rays_commands import FilterOptions, SplitOptions
 from nerg_mi.workflows.render import picture_options
 from nerg_mi.workflows.scene_commands import FilmOptions, StudyOptions
@@ -95,14 +95,6 @@ def test_definitions_are_parsed():
     for pair in ("level", "=3", ""):
         with pytest.raises(NergError, match="write KEY=VALUE"):
             options.parse_definitions([pair], "--define")
-
-
-# ---- Options of the prior field for scenes without tracking ----
-
-
-def test_only_datasets_are_sampled():
-    options = PriorOptions()
-    assert (options.max_samples, options.seed, options.mode) == (10_000_000, 0, "llvm_ad_rgb")
 
 
 # ---- Options of folds, including those of geometries and of parts ----
