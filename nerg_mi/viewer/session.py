@@ -18,7 +18,7 @@ from nerg_mi.errors import NergError, parameter, translate_mitsuba_errors
 from nerg_mi.files.atomic import write_text
 from nerg_mi.formats.areas import AreaSet, Region, read_areas
 from nerg_mi.maths.geometry import Similarity
-from nerg_mi.measures.shares import SummationRule
+from nerg_mi.measures.shares import COARSE, SummationRule
 from nerg_mi.measures.visits import MARGIN, Aoi, BoxAoi
 from nerg_mi.probes.probes import place_probes
 from nerg_mi.progress import SILENT
@@ -87,10 +87,7 @@ class Listener(Protocol):
 SHAPES_PER_STEP = 16
 """Maximum number of shapes whose attention shares are computed in one step."""
 
-SHARE_RULE = SummationRule(rtol=0.02, atol=5e-4, unseen_atol=5e-4)
-"""Accuracy of the attention shares: errors that are hardly visible with one decimal of a per cent."""
-
-PRELIMINARY_SHARE_RULE = SummationRule(rtol=1, atol=1, unseen_atol=1)
+PRELIMINARY_SHARE_RULE = SummationRule(rtol=1, atol=1)
 """Accuracy of the first attention shares."""
 
 
@@ -103,8 +100,8 @@ class AttentionShare:
 
     @property
     def is_final(self) -> bool:
-        """Whether the error is within `SHARE_RULE`."""
-        return self.error <= SHARE_RULE.rtol * self.share + SHARE_RULE.atol
+        """Whether the error is within the tolerance."""
+        return self.error <= COARSE.rtol * self.share + COARSE.atol
 
 
 def iter_attention_shares(
@@ -114,7 +111,7 @@ def iter_attention_shares(
     shapes: Sequence[str],
     shape_aois: Sequence[Aoi] | None = None,
 ) -> Iterator[dict[str, AttentionShare]]:
-    """Compute the attention shares of areas and shapes in steps: first preliminary ones, then within `SHARE_RULE`.
+    """Compute the attention shares of areas and shapes in steps: first preliminary ones, then within `COARSE`.
 
     Parameters
     ----------
@@ -142,7 +139,7 @@ def iter_attention_shares(
         for a in range(0, len(shapes), SHAPES_PER_STEP)
     ]
     position = np.asarray(observer, np.float32)[None]
-    for rule in (PRELIMINARY_SHARE_RULE, SHARE_RULE):
+    for rule in (PRELIMINARY_SHARE_RULE, COARSE):
         for group in groups:
             shares = compute_shares(scene, [aoi for _, aoi, _ in group], position, margin=group[0][2], rule=rule)
             yield {

@@ -10,6 +10,7 @@ from nerg_mi.formats.areas import Region
 from nerg_mi.maths.geometry import intersect_box_numpy
 from nerg_mi.maths.sphere import fibonacci_directions, indices_in_cone
 from nerg_mi.measures.shares import (
+    COARSE,
     INITIAL_DIRECTIONS,
     SamplePoints,
     SummationRule,
@@ -109,6 +110,19 @@ def test_smaller_tolerance_uses_more_directions():
         errors.append(shares.error[0, 0])
         requested.append(sum(hall.requested))
     assert errors[0] > errors[2] and requested[0] < requested[2] < 1 << 19
+
+
+def test_coarse_shares_of_many_areas_need_few_directions():
+    hall = Hall()
+    tiles = [Region.create("tile", (1.9, y, z), (2.1, y + 1, z + 1)) for y in range(-6, 6) for z in range(3)]
+    aois, members = [BoxAoi(tile) for tile in tiles], [(k,) for k in range(len(tiles))]
+    shares = gaze_shares(hall.query_from, OBSERVERS[:1], aois, members, 0.0, COARSE)
+    assert (shares.error <= COARSE.rtol * shares.share + COARSE.atol).all()
+    assert sum(hall.requested) < 4 * INITIAL_DIRECTIONS
+    fine = gaze_shares(Hall().query_from, OBSERVERS[:1], aois, members, 0.0)
+    assert (np.abs(shares.share - fine.share) <= shares.error + fine.error).all()
+    is_visible = fine.share > 1e-3
+    assert np.abs(shares.share / fine.share - 1)[is_visible].max() < 0.1 and is_visible.any()
 
 
 def test_empty_inputs():
