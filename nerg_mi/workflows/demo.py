@@ -79,8 +79,8 @@ class DemoResult:
     report: dict
 
 
-def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Reporter = SILENT) -> DemoResult:
-    """Render all images of the demo to the folder ``out``, which is created.
+def make_demo(output: str | Path, options: DemoOptions | None = None, reporter: Reporter = SILENT) -> DemoResult:
+    """Render all images of the demo to the folder ``output``, which is created.
 
     Progress names each of `STAGES` when it starts. Raises `NergError` if a checkpoint is missing, and
     ``KeyboardInterrupt`` within a second after Ctrl-C.
@@ -89,8 +89,8 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
     width, spp, seed = options.width, options.spp, options.seed
     if width < 12 or spp < 1:
         raise NergError(f"the demo needs images at least 12 pixels wide and 1 sample per pixel, got {width} and {spp}")
-    out = Path(out)
-    check_folder(out)
+    output = Path(output)
+    check_folder(output)
     scene = find_store_scene() if options.scene is None else Path(options.scene)
     defaults = dict(options.defaults or {})
     inputs = _inputs(scene, defaults)
@@ -142,19 +142,19 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
     if not tops:
         raise NergError(f'the gaze is 0 in all images: move the observer of "{scene}", or train its gaze field longer')
     heat = Heat(max(tops))
-    files = _write_pictures(out, pictures, heat, observer_pixel(seen), describe_basis(seen), record)
+    files = _write_pictures(output, pictures, heat, observer_pixel(seen), describe_basis(seen), record)
     for key, value in (record.text() | describe_bases(seen)).items():
         camera.bitmap.metadata()[key] = value
-    write_bitmap_exr(out / "scene.exr", camera.bitmap)
-    files.append(out / "scene.exr")
+    write_bitmap_exr(output / "scene.exr", camera.bitmap)
+    files.append(output / "scene.exr")
     clock.start("surfaces")
     eye = tuple(float(v) for v in np.ravel(np.array(sensor_center(seen.sensors()[FIRST_PERSON]))))
     if (scene.parent / TWIN).is_file():
-        files.append(_bake(scene.parent / TWIN, inputs[2], eye, out / "heatmap.glb", mode, seed))
+        files.append(_bake(scene.parent / TWIN, inputs[2], eye, output / "heatmap.glb", mode, seed))
     clock.start("tracked gaze")
     tracked = []
     if scene == find_store_scene() and inputs[2] == scene.parent / CHECKPOINTS["gaze"]:
-        tracked = [write_recording(out / TRACKED)]
+        tracked = [write_recording(output / TRACKED)]
         files += tracked
     clock.start("report")
     # The AOIs are next to the scene file.
@@ -173,12 +173,12 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
     rendered = {"camera": camera, "own": own_view, "sphere": sphere}
     evaluation = find_evaluation(scene, inputs[2])
     files_shown = [*inputs[1:], *tracked, *evaluation]
-    made = make_report(files_shown, out / "report.html", shown, _StageReporter(clock), rendered)
+    made = make_report(files_shown, output / "report.html", shown, _StageReporter(clock), rendered)
     files.append(made.path)
     if made.run.observed_objects:
         rows = [{"object": o.name, "observer_share": round(o.predicted.mean, 6)} for o in made.run.observed_objects]
-        write_csv(out / "aoi.csv", rows)
-        files.append(out / "aoi.csv")
+        write_csv(output / "aoi.csv", rows)
+        files.append(output / "aoi.csv")
     clock.stop()
 
     report = {
@@ -195,8 +195,8 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
         "inputs": {p.name: file_sha256(p) for p in [*inputs, *evaluation]},
         "outputs": {p.name: file_sha256(p) for p in files},
     }
-    write_json(out / "run.json", report)
-    files.append(out / "run.json")
+    write_json(output / "run.json", report)
+    files.append(output / "run.json")
     for path in files:
         reporter.message(f"wrote {path}")
     for results, verdict in made.run.verdicts:
@@ -204,15 +204,15 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
     return DemoResult(files, clock.seconds, report)
 
 
-def make_demo_to_look_at(out: Path, options: DemoOptions, reporter: Reporter) -> None:
+def make_demo_to_look_at(output: Path, options: DemoOptions, reporter: Reporter) -> None:
     """Call `make_demo`, and report what it does and which files to open."""
     reporter.message(
         f"The demo renders a small store and where a simulated shopper looks: {len(STAGES)} steps, about half a "
         "minute on two idle cores."
     )
-    make_demo(out, options, reporter)
-    reporter.message(f"Report: {out / 'report.html'}. Pictures: {out / 'occlusion.png'}, {out / 'gaze.png'}.")
-    reporter.message(f"Open it with: {_viewer(out / 'report.html')}")
+    make_demo(output, options, reporter)
+    reporter.message(f"Report: {output / 'report.html'}. Pictures: {output / 'occlusion.png'}, {output / 'gaze.png'}.")
+    reporter.message(f"Open it with: {_viewer(output / 'report.html')}")
 
 
 def _viewer(page: Path) -> str:
@@ -297,7 +297,7 @@ def sphere_integral(sphere: Channels) -> float:
 
 
 def _write_pictures(
-    out: Path,
+    output: Path,
     pictures: Mapping[str, Channels],
     heat: Heat,
     marker: tuple[float, float] | None,
@@ -328,9 +328,9 @@ def _write_pictures(
     }
     files = []
     for name, draw in drawn.items():
-        files.append(out / f"{name}.png")
+        files.append(output / f"{name}.png")
         save(draw(), files[-1], record)
-    files.append(out / "color.png")
+    files.append(output / "color.png")
     write_png(files[-1], srgb(camera.color), record.text())
     return files
 

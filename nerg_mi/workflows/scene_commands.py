@@ -173,7 +173,7 @@ declare(
     "report.",
     options=DemoOptions,
     without=("scene",),
-    out=out("Folder to write to; it is created.", default=Path("out/demo")),
+    output=out("Folder to write to; it is created.", default=Path("out/demo")),
 )
 
 
@@ -759,7 +759,7 @@ plots. A full study takes up to half an hour.""",
     options=StudyOptions,
     without=("worker_wait",),
     scene=argument("Scene file (.xml), or a built-in scene: slab, sphere, sheets, fog or ramp.", str),
-    out=out("Folder to write to; it is created."),
+    output=out("Folder to write to; it is created."),
 )
 
 

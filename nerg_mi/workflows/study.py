@@ -55,9 +55,9 @@ class StudyResult(ResultTables):
 
 
 def run_study(
-    scene: str | Path, out: str | Path, options: StudyOptions | None = None, reporter: Reporter = SILENT
+    scene: str | Path, output: str | Path, options: StudyOptions | None = None, reporter: Reporter = SILENT
 ) -> StudyResult:
-    """Study ``scene``, a scene file or the name of an analytic scene, and write tables and plots to the folder ``out``.
+    """Study ``scene``, a scene file or the name of an analytic scene, and write tables and plots to ``output``.
 
     The files are study.csv (one row per setting), study.md (grouped by parameter), scaling.csv, study.json and two
     plots. With ``options.store`` or ``options.scheduler`` a few settings form a part, which is stored and may run
@@ -72,8 +72,8 @@ def run_study(
             f"{options.repeats}"
         )
     pattern = _expression(options.only)
-    out = Path(out)
-    check_folder(out)
+    output = Path(output)
+    check_folder(output)
     mode = activate_variant(options.mode)
     import drjit as dr
 
@@ -93,7 +93,9 @@ def run_study(
 
     if options.in_parts:
         common = plan_study(subject, scene, replace(options, mode=mode))
-        table, scaling, timed_by = _measure_in_parts(common, subject, rows, PartRunner(options, out, reporter), out)
+        table, scaling, timed_by = _measure_in_parts(
+            common, subject, rows, PartRunner(options, output, reporter), output
+        )
     else:
         table = study.measure_rows(subject, rows, repeats, samples, step)
         scaling = study.measure_scaling(subject, min(repeats, 3), options.quick, step)
@@ -121,7 +123,7 @@ def run_study(
         "scaling": scaling,
     }
     sources = list_scene_files(scene, options.defaults) if existing_files(scene) else []
-    files = _write(out, subject, report, make_provenance("nerg study", sources, study.SEED, options))
+    files = _write(output, subject, report, make_provenance("nerg study", sources, study.SEED, options))
     for line in study_tables.summarise(report):
         reporter.message(line)
     for path in files:
@@ -147,13 +149,13 @@ def _select_settings(all_settings: list[StudyRow], pattern: re.Pattern, only: st
     return rows
 
 
-def _write(out: Path, subject: StudySubject, report: dict, record: Provenance) -> list[Path]:
-    files = study_tables.write_tables(out, report)
+def _write(output: Path, subject: StudySubject, report: dict, record: Provenance) -> list[Path]:
+    files = study_tables.write_tables(output, report)
     width, height = report["size"]
     title = f"{subject.name}, {width} x {height}, {report['variant']}"
-    study_tables.plot_errors(out / "errors.png", report["rows"], f"Error against time: {title}", record)
-    study_tables.plot_scaling(out / "scaling.png", report["scaling"], f"Cost of the default: {title}", record)
-    return [*files, out / "errors.png", out / "scaling.png"]
+    study_tables.plot_errors(output / "errors.png", report["rows"], f"Error against time: {title}", record)
+    study_tables.plot_scaling(output / "scaling.png", report["scaling"], f"Cost of the default: {title}", record)
+    return [*files, output / "errors.png", output / "scaling.png"]
 
 
 def effort(options: StudyOptions) -> tuple[int, int]:
@@ -199,7 +201,7 @@ def plan_study(subject: StudySubject, scene: str | Path, options: StudyOptions) 
 
 
 def _measure_in_parts(
-    common: PlannedStudy, subject: StudySubject, rows: Sequence[StudyRow], parts: PartRunner, out: Path
+    common: PlannedStudy, subject: StudySubject, rows: Sequence[StudyRow], parts: PartRunner, output: Path
 ) -> tuple[list[dict], list[dict], list[dict]]:
     """Measure ``rows`` (the default first) and the scaling in parts.
 
@@ -212,7 +214,7 @@ def _measure_in_parts(
     some = [tuple(numbers[k : k + ROWS]) for k in range(0, len(numbers), ROWS)]
     tasks = [Part(numbers, f"{len(numbers)} settings from number {numbers[0]}") for numbers in some]
     tasks.append(Part(None, "cost against size"))
-    plan = Plan(f"nerg study {out.absolute()}", measure_part, common, tasks, ".json")
+    plan = Plan(f"nerg study {output.absolute()}", measure_part, common, tasks, ".json")
     return _join_parts([read_json(made.path, "part of a study") for made in parts.run(plan)])
 
 
