@@ -43,12 +43,11 @@ COLUMNS = {
 
 def make(path: Path, resolution: int) -> None:
     """Splats of the store's field."""
+    from nerg_mi.environment.conversion import export_splats
     from nerg_mi.workflows.demo import find_store_scene
-    from nerg_mi.workflows.export import export_splats
-    from nerg_mi.workflows.radiance_commands import SplatOptions
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    export_splats(find_store_scene().parent / "store.safetensors", path, SplatOptions(resolution=resolution))
+    export_splats(find_store_scene().parent / "store.safetensors", resolution=resolution).save(path)
 
 
 def splat_scene(folder: Path) -> Path:

@@ -26,7 +26,7 @@ from . import registration as _registration
 
 if TYPE_CHECKING:
     from .alignment.align import align
-    from .api.analysis import bake, draw, export, export_scene, render_film, report, statistics, write_scene
+    from .api.analysis import bake, draw, export_scene, render_film, report, statistics, write_scene
     from .api.arrays import Camera
     from .api.evaluation import evaluate_gaze, evaluate_radiance, folds, next_look, study
     from .api.gaze import load_gaze
@@ -36,7 +36,14 @@ if TYPE_CHECKING:
     from .api.scene import Scene, make_scene
     from .api.training import train_gaze, train_prior, train_radiance
     from .environment.contents import DensityGrid
-    from .environment.conversion import import_checkpoint
+    from .environment.conversion import (
+        export_mesh,
+        export_points,
+        export_splats,
+        export_torch_ngp,
+        export_volume,
+        import_checkpoint,
+    )
     from .environment.trained import load_field
     from .errors import NergError
     from .rays.dataset import load_rays
@@ -65,8 +72,12 @@ _MODULES = {
     "draw": "nerg_mi.api.analysis",
     "evaluate_gaze": "nerg_mi.api.evaluation",
     "evaluate_radiance": "nerg_mi.api.evaluation",
-    "export": "nerg_mi.api.analysis",
+    "export_mesh": "nerg_mi.environment.conversion",
+    "export_points": "nerg_mi.environment.conversion",
     "export_scene": "nerg_mi.api.analysis",
+    "export_splats": "nerg_mi.environment.conversion",
+    "export_torch_ngp": "nerg_mi.environment.conversion",
+    "export_volume": "nerg_mi.environment.conversion",
     "filter_rays": "nerg_mi.api.recordings",
     "find_poses": "nerg_mi.train.poses",
     "folds": "nerg_mi.api.evaluation",
@@ -113,8 +124,12 @@ __all__ = [
     "draw",
     "evaluate_gaze",
     "evaluate_radiance",
-    "export",
+    "export_mesh",
+    "export_points",
     "export_scene",
+    "export_splats",
+    "export_torch_ngp",
+    "export_volume",
     "filter_rays",
     "find_poses",
     "folds",

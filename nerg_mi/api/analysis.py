@@ -10,21 +10,12 @@ from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
 from nerg_mi.aoi.options import StatisticsOptions
-from nerg_mi.environment.trained import TrainedField
-from nerg_mi.errors import NergError
 from nerg_mi.files.values import FilePath
 from nerg_mi.rays.rays import Rays
-from nerg_mi.workflows.radiance_commands import (
-    MeshOptions,
-    PointOptions,
-    SceneExportOptions,
-    SplatOptions,
-    TorchNgpOptions,
-    VolumeOptions,
-)
+from nerg_mi.workflows.radiance_commands import SceneExportOptions
 from nerg_mi.workflows.scene_commands import BakeOptions, FilmOptions, ReportOptions, SceneOptions
 
-from .arguments import check_output, resolve_file
+from .arguments import check_output
 from .calls import Progress, report_progress, show_figure
 from .gaze import list_inputs
 from .objects import as_file, as_scene_file, build_options, copy_from_session
@@ -35,10 +26,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from nerg_mi.aoi.output import StatisticsResult
-    from nerg_mi.fields.radiance import RadianceField
     from nerg_mi.workflows.bake import Bake
     from nerg_mi.workflows.bake_splats import SplatBake
-    from nerg_mi.workflows.export import Export
     from nerg_mi.workflows.export_scene import SceneExport
     from nerg_mi.workflows.report import ReportResult
 
@@ -363,79 +352,6 @@ def render_film(
     with report_progress(progress) as reporter:
         resolved = build_options(FilmOptions, "render_film", options, overrides)
         return render_to_file(as_file(scene, "scene"), Path(output), resolved, reporter).path
-
-
-# ---- Fields for other programs, and poses of photos ----
-
-_EXPORTS = {
-    "mesh": ("export_mesh", MeshOptions),
-    "points": ("export_points", PointOptions),
-    "splats": ("export_splats", SplatOptions),
-    "volume": ("export_volume", VolumeOptions),
-    "torch-ngp": ("export_torch_ngp", TorchNgpOptions),
-}
-_EXPORT_SUFFIXES = {".glb": "mesh", ".vol": "volume", ".pth": "torch-ngp"}
-
-
-def export(
-    field: TrainedField[RadianceField] | FilePath,
-    output: FilePath,
-    kind: str | None = None,
-    *,
-    progress: Progress = None,
-    **options: Any,
-) -> Export:
-    """Write a radiance field in a format of other programs.
-
-    Parameters
-    ----------
-    field : TrainedField or path
-        The radiance field.
-    output : path
-        File to write.
-    kind : str, optional
-        ``mesh`` (.ply, .glb), ``points`` (.ply, .glb), ``splats`` (.ply), ``volume`` (.vol) or ``torch-ngp`` (.pth).
-        Default: by the name of the file; .ply needs a kind.
-    progress : bool, Reporter or None
-        None shows a progress bar in notebooks, True shows one anywhere, False none; a `Reporter` receives everything.
-    **options
-        Options of ``nerg export KIND``, such as ``resolution=128``.
-
-    Returns
-    -------
-    Export
-        The written ``files``, and the ``surface`` of a mesh or points.
-
-    Raises
-    ------
-    NergError
-        The kind, an option or the field is invalid.
-
-    Examples
-    --------
-    >>> import nerg_mi as nerg
-    >>> from importlib.resources import files
-    >>> field = nerg.load_field(files("nerg_mi.scenes.store") / "store.safetensors")
-    >>> nerg.export(field, folder / "store.vol", resolution=16).files[0].name
-    'store.vol'
-    """
-    from nerg_mi.workflows import export as exports
-
-    check_output(output)
-    chosen = kind or _EXPORT_SUFFIXES.get(Path(output).suffix.lower())
-    if chosen not in _EXPORTS:
-        reason = "since its name does not tell it" if kind is None else f'got "{kind}"'
-        raise NergError(f'kind must be one of {", ".join(_EXPORTS)} for "{output}", {reason}')
-    function, option_type = _EXPORTS[chosen]
-    with report_progress(progress) as reporter:
-        resolved = build_options(option_type, f"export of {chosen}", None, options)
-        if isinstance(field, TrainedField) and field.kind != "radiance":
-            raise NergError(
-                "export writes radiance fields, not gaze fields; write gaze with its method save, on a surface with "
-                "bake, or in a scene with export_scene"
-            )
-        source = field.network if isinstance(field, TrainedField) else resolve_file(field, "field")
-        return getattr(exports, function)(source, Path(output), resolved, reporter)
 
 
 def export_scene(

@@ -51,7 +51,7 @@ def make_command(row: Row) -> Command:
     elif row.output:
         outputs["output"] = out(row.output, default=None if row.suffices else ...)
     for name, (help, *spellings) in row.more_outputs.items():
-        outputs[name] = extra(None, help, Path, *spellings, group=OUTPUT)
+        outputs[name] = extra(None, help, Path, *(spellings or [f"--{name}"]), group=OUTPUT)
     arguments |= outputs
     members, settings, ranges = list[Any](), dict[str, Any](), find_ranges(function)
     for name in (name for name in kinds if name not in arguments):

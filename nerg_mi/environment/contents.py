@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nerg_mi.errors import NergError, clean_text, translate_mitsuba_errors
+from nerg_mi.errors import NergError, clean_text, parameter, translate_mitsuba_errors
 from nerg_mi.fields.splats import Splats
-from nerg_mi.files.atomic import make_folder, replace_atomically, write_text
+from nerg_mi.files.atomic import check_writable, make_folder, replace_atomically, write_text
 from nerg_mi.files.names import make_portable_name
 from nerg_mi.files.values import to_numbers
 from nerg_mi.formats.meshes import MeshFile, read_mesh_file, with_shading_normals
@@ -106,6 +106,18 @@ class DensityGrid:
         z, y, x = np.shape(self.density)
         lower, upper = (", ".join(f"{v:.4g}" for v in np.asarray(c).tolist()) for c in (self.lower, self.upper))
         return f"<DensityGrid: {x} x {y} x {z} cells, box ({lower}) to ({upper})>"
+
+    def save(self, path: str | os.PathLike[str], color: str | os.PathLike[str] | None = None) -> None:
+        """Write the density to ``path``, and the colour to ``color``, as grid volumes of Mitsuba (.vol).
+
+        Raises `NergError` if the grid has no colour that is to be written, or a file cannot be written.
+        """
+        if color is not None and self.color is None:
+            raise NergError(f"this DensityGrid has no {parameter('color')} to write")
+        for file, values in ((color, self.color), (path, self.density)):
+            if file is not None:
+                check_writable(Path(file), ".vol")
+                write_volume(Path(file), np.asarray(values), self.lower, self.upper)
 
     def volumes(self, to_world: Any = None) -> dict[str, GridVolume]:
         """Return the properties ``density`` and ``color`` of the integrator ``nerg``."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Annotated, Literal, NamedTuple
 
 from nerg_mi.errors import NergError, parameter
@@ -9,12 +11,23 @@ from nerg_mi.fields.gaze_base import AnyGazeField
 from nerg_mi.fields.occupancy import refine_occupancy
 from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.files.values import FilePath, to_path
-from nerg_mi.formats.torch_ngp import ImportOptions, is_nerg_checkpoint, open_checkpoint, read_nerg, read_torch_ngp
-from nerg_mi.progress import Progress, open_reporter
-from nerg_mi.ranges import Range, check_ranges
+from nerg_mi.formats.splats import SurfaceSplats, make_splats
+from nerg_mi.formats.surfaces import Surface, extract_mesh, extract_points, sample_density_and_color
+from nerg_mi.formats.torch_ngp import (
+    ImportOptions,
+    TorchNgpModel,
+    is_nerg_checkpoint,
+    make_torch_ngp,
+    open_checkpoint,
+    read_nerg,
+    read_torch_ngp,
+)
+from nerg_mi.progress import Progress, Reporter, open_reporter
+from nerg_mi.ranges import POSITIVE_VALUES, Range, check_ranges
 from nerg_mi.rendering.scene import get_array_module
 
-from .trained import TrainedField
+from .contents import DensityGrid
+from .trained import TrainedField, open_field
 
 # ---- Import ----
 
@@ -131,3 +144,277 @@ def _describe_field(field: RadianceField, origin: dict) -> str:
         cells = f"{100 * field.occupancy.occupied_fraction:.1f} % of its box occupied"
     behind = "" if field.background is None else f", background of radius {field.background.config.radius:g}"
     return f"radiance: bound {field.box.side / 2:g}, {origin['weights']} weights, {cells}{behind}"
+
+
+# ---- Export ----
+#
+# Radiance fields in the formats of other tools, in the units of the field.
+
+
+def _open(field: TrainedField[RadianceField] | FilePath, reporter: Reporter) -> RadianceField:
+    reporter.progress(0.0, "reading the field")
+    trained = open_field(field)
+    trained.network.require_density(f'"{trained.name}"')
+    reporter.progress(0.01, "sampling the field")
+    if trained.network.box.is_contracted:
+        reporter.message("the scene is unbounded: only the box that the field resolves best is exported")
+    return trained.network
+
+
+@check_ranges
+def export_mesh(
+    field: TrainedField[RadianceField] | FilePath,
+    *,
+    resolution: Annotated[int, Range(2, 2048)] = 256,
+    density_threshold: Annotated[float, POSITIVE_VALUES] | None = None,
+    fill_holes: Annotated[int, Range(0, 2048)] = 1,
+    min_component_area: Annotated[float, Range(0, 1)] = 0.001,
+    keep_unseen: bool = False,
+    up: Literal["z", "y"] = "z",
+    progress: Progress = None,
+) -> Surface:
+    """Extract a mesh with vertex colours by marching cubes. Needs scikit-image.
+
+    Parameters
+    ----------
+    field : TrainedField or path
+        Radiance field (.safetensors).
+    resolution : int
+        Number of grid cells along the longest edge of the field's bounding box.
+    density_threshold : float, optional
+        Density of the extracted surface in 1/unit. Default: absorbs half of the light across a grid cell.
+    fill_holes : int
+        Close holes of up to twice this number of grid cells; 0 closes none.
+    min_component_area : float
+        Smallest area of a connected component, as a fraction of the largest one; smaller components are removed.
+    keep_unseen : bool
+        Keep surfaces that no training view saw, such as backs and insides.
+    up : str
+        Up axis of the field, z or y. It is turned to +y in .glb files.
+    progress : bool, Reporter or None
+        Progress and messages (`nerg_mi.progress.Progress`).
+
+    Returns
+    -------
+    Surface
+        The mesh, with a method ``save`` (.ply, .glb).
+
+    Raises
+    ------
+    NergError
+        There is no surface, or an argument is invalid.
+    ImportError
+        scikit-image is not installed.
+
+    Examples
+    --------
+    >>> import nerg_mi as nerg
+    >>> from importlib.resources import files
+    >>> field = nerg.load_field(files("nerg_mi.scenes.store") / "store.safetensors")
+    >>> mesh = nerg.export_mesh(field, resolution=32)
+    >>> mesh.save(folder / "store.ply")
+    """
+    with open_reporter(progress) as reporter:
+        mesh = extract_mesh(
+            _open(field, reporter), resolution, density_threshold, fill_holes, min_component_area, keep_unseen
+        )
+        r = mesh.report
+        reporter.message(
+            f"surface at a density of {r['threshold']:.4g} / unit, cells of {r['cell']:.4g} units ({_by(r['lattice'])})"
+        )
+        reporter.message(
+            f"{r['cells_filled']:,} cells of holes filled; removed {r['unseen_faces']:,} faces that no training view "
+            f"saw, and {r['floater_faces']:,} faces in {r['pieces'] - r['pieces_kept']:,} small components; "
+            f"{r['pieces_kept']} components kept"
+        )
+        reporter.message(
+            f"{len(mesh.vertices):,} vertices, {mesh.face_count:,} faces; open edges: {r['edges_at_the_box']:,} at "
+            f"the bounding box, {r['edges_of_holes']:,} around holes"
+        )
+    return replace(mesh, up=up)
+
+
+@check_ranges
+def export_points(
+    field: TrainedField[RadianceField] | FilePath,
+    *,
+    resolution: Annotated[int, Range(2, 2048)] = 256,
+    density_threshold: Annotated[float, POSITIVE_VALUES] | None = None,
+    max_points: Annotated[int, Range(1, 10**9)] | None = None,
+    up: Literal["z", "y"] = "z",
+    progress: Progress = None,
+) -> Surface:
+    """Sample surface points with normals and colours.
+
+    Parameters
+    ----------
+    field : TrainedField or path
+        Radiance field (.safetensors).
+    resolution : int
+        Number of grid cells along the longest edge of the field's bounding box.
+    density_threshold : float, optional
+        Density of the extracted surface in 1/unit. Default: absorbs half of the light across a grid cell.
+    max_points : int, optional
+        Maximum number of points; if there are more, a random selection is kept. Default: all.
+    up : str
+        Up axis of the field, z or y. It is turned to +y in .glb files.
+    progress : bool, Reporter or None
+        Progress and messages (`nerg_mi.progress.Progress`).
+
+    Returns
+    -------
+    Surface
+        The points, with a method ``save`` (.ply, .glb).
+
+    Raises
+    ------
+    NergError
+        There is no surface, or an argument is invalid.
+
+    Examples
+    --------
+    >>> import nerg_mi as nerg
+    >>> from importlib.resources import files
+    >>> field = nerg.load_field(files("nerg_mi.scenes.store") / "store.safetensors")
+    >>> len(nerg.export_points(field, resolution=32, max_points=100).vertices)
+    100
+    """
+    with open_reporter(progress) as reporter:
+        points = extract_points(_open(field, reporter), resolution, density_threshold, max_points)
+        reporter.message(f"{len(points.vertices):,} points at a density of {points.report['threshold']:.4g} / unit")
+    return replace(points, up=up)
+
+
+@check_ranges
+def export_splats(
+    field: TrainedField[RadianceField] | FilePath,
+    *,
+    resolution: Annotated[int, Range(2, 2048)] = 256,
+    density_threshold: Annotated[float, POSITIVE_VALUES] | None = None,
+    progress: Progress = None,
+) -> SurfaceSplats:
+    """Place Gaussian splats on the surface, for splat viewers and the volume "splats".
+
+    Parameters
+    ----------
+    field : TrainedField or path
+        Radiance field (.safetensors).
+    resolution : int
+        Number of grid cells along the longest edge of the field's bounding box.
+    density_threshold : float, optional
+        Density of the extracted surface in 1/unit. Default: absorbs half of the light across a grid cell.
+    progress : bool, Reporter or None
+        Progress and messages (`nerg_mi.progress.Progress`).
+
+    Returns
+    -------
+    SurfaceSplats
+        The Gaussians, with a method ``save`` (.ply).
+
+    Raises
+    ------
+    NergError
+        There is no surface, or an argument is invalid.
+
+    Examples
+    --------
+    >>> import nerg_mi as nerg
+    >>> from importlib.resources import files
+    >>> field = nerg.load_field(files("nerg_mi.scenes.store") / "store.safetensors")
+    >>> splats = nerg.export_splats(field, resolution=16)
+    >>> splats.save(folder / "store.ply")
+    """
+    with open_reporter(progress) as reporter:
+        splats = make_splats(_open(field, reporter), resolution, density_threshold)
+        reporter.message(
+            f"{len(splats):,} Gaussians, cells of {splats.cell:.4g} units; moved by {splats.shift:.2g} units "
+            "(median) to the rendered depth"
+        )
+    return splats
+
+
+@check_ranges
+def export_volume(
+    field: TrainedField[RadianceField] | FilePath,
+    *,
+    resolution: Annotated[int, Range(2, 2048)] = 256,
+    color: bool = False,
+    progress: Progress = None,
+) -> DensityGrid:
+    """Sample density and colour on a grid, as Mitsuba grid volumes.
+
+    A scene reads the files by a gridvolume with use_grid_bbox true, that of the colour also with raw true.
+
+    Parameters
+    ----------
+    field : TrainedField or path
+        Radiance field (.safetensors).
+    resolution : int
+        Number of grid cells along the longest edge of the field's bounding box.
+    color : bool
+        Whether to sample the colour, too.
+    progress : bool, Reporter or None
+        Progress and messages (`nerg_mi.progress.Progress`).
+
+    Returns
+    -------
+    DensityGrid
+        The grid, with a method ``save`` (.vol).
+
+    Raises
+    ------
+    NergError
+        The field is empty, or an argument is invalid.
+
+    Examples
+    --------
+    >>> import nerg_mi as nerg
+    >>> from importlib.resources import files
+    >>> field = nerg.load_field(files("nerg_mi.scenes.store") / "store.safetensors")
+    >>> grid = nerg.export_volume(field, resolution=16)
+    >>> grid.save(folder / "store.vol")
+    """
+    with open_reporter(progress) as reporter:
+        density, colors, lower, upper = sample_density_and_color(_open(field, reporter), resolution, color)
+        corners = " to ".join(f"({', '.join(f'{v:.4g}' for v in corner)})" for corner in (lower, upper))
+        reporter.message(f"{_by(density.shape[::-1])} voxels from {corners}; density up to {density.max():.4g} / unit")
+    return DensityGrid(density, lower, upper, colors)
+
+
+def export_torch_ngp(field: TrainedField[RadianceField] | FilePath, *, progress: Progress = None) -> TorchNgpModel:
+    """Convert a field to a torch-ngp checkpoint, if its grid and networks fit its layout.
+
+    Parameters
+    ----------
+    field : TrainedField or path
+        Radiance field (.safetensors).
+    progress : bool, Reporter or None
+        Progress and messages (`nerg_mi.progress.Progress`).
+
+    Returns
+    -------
+    TorchNgpModel
+        The checkpoint, with a method ``save`` (.pth).
+
+    Raises
+    ------
+    NergError
+        The grid or the networks do not fit.
+
+    Examples
+    --------
+    >>> import nerg_mi as nerg
+    >>> from importlib.resources import files
+    >>> field = nerg.load_field(files("nerg_mi.scenes.store") / "store.safetensors")
+    >>> try:
+    ...     nerg.export_torch_ngp(field)
+    ... except nerg.NergError as error:
+    ...     print("torch-ngp" in str(error))
+    True
+    """
+    with open_reporter(progress) as reporter:
+        return make_torch_ngp(_open(field, reporter))
+
+
+def _by(shape: Sequence[int]) -> str:
+    return " x ".join(map(str, shape))

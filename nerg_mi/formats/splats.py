@@ -6,6 +6,7 @@ import os
 import re
 import struct
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from nerg_mi.fields.splats import (
     scales_from_logs,
     splats_from_raw_parameters,
 )
+from nerg_mi.files.atomic import check_writable
 from nerg_mi.files.safe_read import MAX_JSON_BYTES, map_bytes, open_file, open_gzip, translate_read_errors
 from nerg_mi.files.schema import check_json
 from nerg_mi.maths.coordinates import check_near_origin
@@ -439,9 +441,28 @@ _SURFEL_THICKNESS, _OPACITY = 0.1, 0.9
 _NEIGHBORS, _NEAREST = 12, 4
 
 
-def make_splats(
-    field: RadianceField, resolution: int = 256, threshold: float | None = None
-) -> tuple[Splats, dict[str, float]]:
+@dataclass(frozen=True)
+class SurfaceSplats(Splats):
+    """Gaussians on the surface of a radiance field.
+
+    Attributes
+    ----------
+    cell
+        Size of a cell, in the units of the field.
+    shift
+        Median distance by which Gaussians were moved to the depth that rays see, in the same units.
+    """
+
+    cell: float = 0.0
+    shift: float = 0.0
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Write the Gaussians (.ply). Raises `NergError` for another suffix, or if the file cannot be written."""
+        check_writable(path := Path(path), ".ply")
+        write_ply_splats(path, self, comments=("Gaussian splats of a radiance field, by nerg_mi",))
+
+
+def make_splats(field: RadianceField, resolution: int = 256, threshold: float | None = None) -> SurfaceSplats:
     """Make Gaussians from the surface of a radiance field, in the frame of the field.
 
     Parameters
@@ -452,14 +473,6 @@ def make_splats(
         Cells along the longest edge.
     threshold
         Density at the surface. Default: that of `extract_points`.
-
-    Returns
-    -------
-    splats
-        The Gaussians.
-    report
-        ``cell``: size of a cell; ``moved``: median distance by which Gaussians were moved to the depth that rays see.
-        Both are in the units of the field.
 
     Raises
     ------
@@ -480,10 +493,10 @@ def make_splats(
     widths = SURFEL_WIDTH * np.clip(spacing, 0.25 * cell, 2 * cell)
     scales = np.stack([widths, widths, _SURFEL_THICKNESS * widths / SURFEL_WIDTH], axis=1)
     opacities = np.full(len(p), _OPACITY)
-    splats = Splats(
-        p, scales, matrices_to_quaternions(_make_frames(normals)), opacities, harmonics_from_colors(surface.colors)
+    rotations, colors = matrices_to_quaternions(_make_frames(normals)), harmonics_from_colors(surface.colors)
+    return SurfaceSplats(
+        p, scales, rotations, opacities, colors, cell=float(cell), shift=float(np.median(np.abs(shift)))
     )
-    return splats, {"cell": float(cell), "moved": float(np.median(np.abs(shift)))}
 
 
 def _smooth_normals(p: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

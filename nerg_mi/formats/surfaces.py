@@ -13,7 +13,7 @@ import numpy as np
 from nerg_mi.errors import NergError, import_extra, parameter
 from nerg_mi.fields.extraction import FieldSampler, Lattice, cell_opacity, find_crossings, surface_density
 from nerg_mi.fields.radiance import RadianceField
-from nerg_mi.files.atomic import write_bytes
+from nerg_mi.files.atomic import check_writable, write_bytes
 from nerg_mi.maths.color import decode_srgb, encode_srgb
 
 from .gltf import Attribute, encode_unlit_glb
@@ -45,6 +45,15 @@ class Surface:
     normals: np.ndarray
     colors: np.ndarray
     report: dict
+    up: str = "z"  # axis that points up, y or z
+
+    def save(self, path: str | Path) -> None:
+        """Write the surface (.ply, .glb). Raises `NergError` for another suffix, or if the file cannot be written."""
+        check_writable(path := Path(path), ".ply", ".glb")
+        if path.suffix.lower() == ".ply":
+            write_ply(self, path)
+        else:
+            write_glb(self, path, self.up)
 
     @property
     def face_count(self) -> int:

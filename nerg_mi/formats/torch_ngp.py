@@ -422,21 +422,23 @@ def _store_layers(state: dict, name: str, net: MLP) -> None:
     state |= {f"{name}.{i}.weight": w.numpy() for i, w in enumerate(net.weights)}
 
 
-def write_torch_ngp(field: RadianceField, path: str | Path) -> None:
-    """Write ``field`` as a torch-ngp checkpoint in the form of its ``ngp.pth``, without density grid and optimiser."""
-    stats = {"loss": [], "valid_loss": [], "results": [], "checkpoints": [], "best_result": None}
-    threshold = 0.0 if field.occupancy is None else field.occupancy.coarse.threshold
-    write_torch(
-        path,
-        {
-            "epoch": 0,
-            "global_step": 0,
-            "stats": stats,
-            "mean_count": 0,
-            "mean_density": threshold,
-            "model": make_state_dict(field),
-        },
-    )
+@dataclass(frozen=True, eq=False)
+class TorchNgpModel:
+    """The networks of a radiance field as a checkpoint of torch-ngp: ``state`` has the arrays by name."""
+
+    state: dict[str, np.ndarray]
+    mean_density: float
+
+    def save(self, path: str | Path) -> None:
+        """Write the checkpoint (.pth) in the form of torch-ngp's ``ngp.pth``, without density grid and optimiser."""
+        stats = {"loss": [], "valid_loss": [], "results": [], "checkpoints": [], "best_result": None}
+        head = {"epoch": 0, "global_step": 0, "stats": stats, "mean_count": 0}
+        write_torch(path, {**head, "mean_density": self.mean_density, "model": self.state})
+
+
+def make_torch_ngp(field: RadianceField) -> TorchNgpModel:
+    """Return ``field`` in the layout of torch-ngp. Raises `NergError` if its grid or networks do not fit."""
+    return TorchNgpModel(make_state_dict(field), 0.0 if field.occupancy is None else field.occupancy.coarse.threshold)
 
 
 # ---- Checkpoints of the NeRG authors (github.com/ch-andrei/nerg-neural-gaze): a gaze field and its NeRF ----

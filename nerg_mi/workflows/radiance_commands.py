@@ -1,13 +1,8 @@
 """``nerg train radiance``: Train a radiance field on posed photos and report the error on held-out views.
 ``nerg eval radiance``: Score a radiance field on held-out views: PSNR, SSIM and, where it is known, depth error.
-``nerg export mesh``: Extract a mesh with vertex colours by marching cubes (.ply, .glb).
-``nerg export points``: Sample surface points with normals and colours (.ply, .glb).
-``nerg export splats``: Place Gaussian splats on the surface (.ply), for splat viewers and the volume "splats".
-``nerg export volume``: Sample density and colour on a grid, as Mitsuba grid volumes (.vol).
 ``nerg export scene``: Write a scene with its gaze for Rerun (.rrd) or OpenUSD (.usdc, .usda).
-``nerg export torch-ngp``: Write a torch-ngp checkpoint (.pth), for fields whose grid and networks fit its layout.
 
-Options of these commands. The workflows are in `.train_radiance` and `.export`.
+Options of these commands.
 """
 
 from __future__ import annotations
@@ -183,87 +178,6 @@ declare(
 
 
 @dataclass(frozen=True, kw_only=True)
-class LatticeOptions(ValidatedDataclass):
-    """The grid on which a radiance field is sampled."""
-
-    resolution: int = option(
-        256,
-        "Number of grid cells along the longest edge of the field's bounding box.",
-        within=Range(2, 2048),
-        group=MODEL,
-    )
-    mode: str = llvm_variant()
-
-
-@dataclass(frozen=True, kw_only=True)
-class ThresholdOptions(LatticeOptions):
-    """Density at which a surface is extracted."""
-
-    density_threshold: float | None = option(
-        None,
-        "Density of the extracted surface in 1/unit.  [default: absorbs half of the light across a grid cell]",
-        within=POSITIVE_VALUES,
-        group=MODEL,
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
-class IsosurfaceOptions(ThresholdOptions):
-    """How a surface is extracted and written."""
-
-    up: str = option("z", "Up axis of the field, z or y. It is turned to +y in .glb files.", group=OUTPUT)
-
-
-@dataclass(frozen=True, kw_only=True)
-class MeshOptions(IsosurfaceOptions):
-    """Options of ``nerg export mesh``."""
-
-    fill_holes: int = option(
-        1, "Close holes of up to twice this number of grid cells; 0 closes none.", within=Range(0, 2048), group=MODEL
-    )
-    min_component_area: float = option(
-        0.001,
-        "Smallest area of a connected component, as a fraction of the largest one; smaller components are removed.",
-        within=Range(0, 1),
-        group=MODEL,
-    )
-    keep_unseen: bool = option(
-        False, "Keep surfaces that no training view saw, such as backs and insides.", group=MODEL
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
-class PointOptions(IsosurfaceOptions):
-    """Options of ``nerg export points``."""
-
-    max_points: int | None = option(
-        None,
-        "Maximum number of points; if there are more, a random selection is kept.  [default: all]",
-        within=Range(1, 10**9),
-        group=OUTPUT,
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
-class SplatOptions(ThresholdOptions):
-    """Options of ``nerg export splats``."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class VolumeOptions(LatticeOptions):
-    """Options of ``nerg export volume``."""
-
-    color: Path | None = option(None, "Second file (.vol), for the colour.  [default: not written]", group=OUTPUT)
-
-
-@dataclass(frozen=True, kw_only=True)
-class TorchNgpOptions(ValidatedDataclass):
-    """Options of ``nerg export torch-ngp``."""
-
-    mode: str = llvm_variant()
-
-
-@dataclass(frozen=True, kw_only=True)
 class SceneExportOptions(EventOptions):
     """Options of ``nerg export scene``."""
 
@@ -312,46 +226,4 @@ declare(
         metavar="FILES",
     ),
     output=out("File to write (.rrd, .usdc, .usda or .usd)."),
-)
-
-_FIELD = argument("Radiance field (.safetensors).")
-
-declare(
-    "export mesh",
-    "nerg_mi.workflows.export:export_mesh",
-    options=MeshOptions,
-    field=_FIELD,
-    output=out("Mesh to write (.ply or .glb)."),
-)
-
-declare(
-    "export points",
-    "nerg_mi.workflows.export:export_points",
-    options=PointOptions,
-    field=_FIELD,
-    output=out("Point cloud to write (.ply or .glb)."),
-)
-
-declare(
-    "export splats",
-    "nerg_mi.workflows.export:export_splats",
-    options=SplatOptions,
-    field=_FIELD,
-    output=out("Gaussian splats to write (.ply)."),
-)
-
-declare(
-    "export volume",
-    "nerg_mi.workflows.export:export_volume",
-    options=VolumeOptions,
-    field=_FIELD,
-    output=out("Grid volume of the density to write (.vol)."),
-)
-
-declare(
-    "export torch-ngp",
-    "nerg_mi.workflows.export:export_torch_ngp",
-    options=TorchNgpOptions,
-    field=_FIELD,
-    output=out("Checkpoint to write (.pth)."),
 )

@@ -578,9 +578,9 @@ def test_objects_in_place_of_outputs_are_refused(gaze, rays, room):
             call()
 
 
-def test_gaze_fields_are_not_exported_as_radiance_fields(gaze, tmp_path):
-    with pytest.raises(nerg.NergError, match="export_scene"):
-        nerg.export(gaze, tmp_path / "a.glb")
+def test_gaze_fields_are_not_exported_as_radiance_fields(gaze):
+    with pytest.raises(nerg.NergError, match="radiance field is needed"):
+        nerg.export_mesh(gaze)
 
 
 def test_messages_name_objects_in_place_of_their_files(gaze, rays, room, tmp_path, written):

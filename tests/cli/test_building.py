@@ -289,7 +289,7 @@ def write_down(*, parts: bool = False, progress: Progress = None):
 def test_a_command_writes_further_files(monkeypatch, tmp_path, capsys):
     """An output that is not given is not written, and the function is told so."""
     row = Row("score", f"{__name__}:write_down", "", output="Score (.txt).", suffixes=(".txt",), computes=False)
-    parts = {"parts": ("Parts (.txt).", "-p", "--parts")}
+    parts = {"parts": ("Parts (.txt).",)}
 
     def nerg(row, *line):
         monkeypatch.setitem(ROWS, "score", row)
@@ -301,12 +301,12 @@ def test_a_command_writes_further_files(monkeypatch, tmp_path, capsys):
             path.unlink()
         return end.value.code, files, capsys.readouterr().out.split("\n")[0]
 
-    output, more = ("-o", tmp_path / "a.txt"), ("-p", tmp_path / "b.txt")
+    output, more = ("-o", tmp_path / "a.txt"), ("--parts", tmp_path / "b.txt")
     row = replace(row, more_outputs=parts)
     assert nerg(row, *output) == (0, {"a.txt"}, "parts: False")
     assert nerg(row, *output, *more) == (0, {"a.txt", "b.txt"}, "parts: True")
     assert nerg(row, *more) == (2, set(), "")
-    assert nerg(row, *output, "-p", tmp_path / "b.png")[:2] == (1, set())
+    assert nerg(row, *output, "--parts", tmp_path / "b.png")[:2] == (1, set())
     row = replace(row, suffices=True)
     assert nerg(row, *more)[:2] == (0, {"b.txt"})
     assert nerg(row)[:2] == (1, set())

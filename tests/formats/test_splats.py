@@ -535,12 +535,12 @@ def store():
 
 
 def test_surfel_depths_equal_field(store):
-    splats, done = make_splats(store, 56)
-    assert len(splats) > 5_000 and done["moved"] < 0.5 * done["cell"]
+    splats = make_splats(store, 56)
+    assert len(splats) > 5_000 and splats.shift < 0.5 * splats.cell
     rng = np.random.default_rng(0)
     d = rng.normal(size=(400, 3)).astype(np.float32)
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     o = np.tile(np.float32([4.4, 2.8, 1.6]), (400, 1))
     ours, opacity = trace_depth(SplatMedium(SplatArrays(splats, ns)), o, d)
     field, _ = trace_depth(FieldMedium(store), o, d)
-    assert np.mean(opacity > 0.5) > 0.98 and np.median(np.abs(ours - field)) < 0.25 * done["cell"]
+    assert np.mean(opacity > 0.5) > 0.98 and np.median(np.abs(ours - field)) < 0.25 * splats.cell

@@ -23,13 +23,13 @@ from nerg_mi.formats.torch_ngp import (
     describe_origin,
     infer_grid_config,
     infer_sh_degree,
+    make_torch_ngp,
     morton_order,
     open_checkpoint,
     pack_bitfield,
     read_nerg,
     read_torch_ngp,
     shorten_floats,
-    write_torch_ngp,
 )
 from nerg_mi.maths.geometry import Box
 from tests.reference import torch_ngp_numpy as reference
@@ -109,7 +109,7 @@ def test05_export_and_import_is_exact(tmp_path, torch):
         save_radiance(field, tmp_path / "f.safetensors", origin)
         again, meta = load_radiance(tmp_path / "f.safetensors", ns)
         assert meta["provenance"]["imported_from"] == "ngp.pth" and again.box == field.box
-        write_torch_ngp(again, tmp_path / "back.pth")
+        make_torch_ngp(again).save(tmp_path / "back.pth")
         back = torch.load(tmp_path / "back.pth", weights_only=True)
         assert set(back["model"]) == set(state)
         for name, value in state.items():
@@ -192,7 +192,7 @@ def test10_grid_of_other_resolution(tmp_path):
 def test11_unrepresentable_fields_are_refused(tmp_path, config, box, said):
     field = RadianceField.random(config, box, ns)
     with pytest.raises(ValueError, match=f"cannot represent this field: {said}"):
-        write_torch_ngp(field, tmp_path / "x.pth")
+        make_torch_ngp(field).save(tmp_path / "x.pth")
     assert not list(tmp_path.iterdir())
 
 
