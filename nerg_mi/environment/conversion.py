@@ -276,8 +276,8 @@ def export_points(
     >>> import nerg_mi as nerg
     >>> from importlib.resources import files
     >>> field = nerg.load_field(files("nerg_mi.scenes.store") / "store.safetensors")
-    >>> len(nerg.export_points(field, resolution=32, max_points=100).vertices)
-    100
+    >>> 0 < len(nerg.export_points(field, resolution=32, max_points=100).vertices) <= 100
+    True
     """
     with open_reporter(progress) as reporter:
         points = extract_points(_open(field, reporter), resolution, density_threshold, max_points)

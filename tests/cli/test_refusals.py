@@ -20,7 +20,7 @@ from nerg_mi.formats.torch_files import write_torch
 from nerg_mi.photos import structure
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.scene import check_scene_file
-from nerg_mi.workflows import poses
+from nerg_mi.train import poses
 from tests.formats.test_torch_ngp import save_nerg as save
 from tests.formats.test_torch_ngp import small_gaze, small_state
 from tests.pictures import SCENE
