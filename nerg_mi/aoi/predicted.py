@@ -14,7 +14,6 @@ import numpy as np
 
 from nerg_mi.alignment.check import read_similarity
 from nerg_mi.errors import NergError, parameter
-from nerg_mi.fields.gaze_base import TRACKING_NOTES
 from nerg_mi.files.tables import join_reasons
 from nerg_mi.formats.areas import AreaGroup, AreaSet, read_regions
 from nerg_mi.formats.meshes import MeshFile
@@ -39,6 +38,7 @@ from nerg_mi.measures.tables import (
 )
 from nerg_mi.measures.visits import ALL, Aoi, Cell
 from nerg_mi.progress import SILENT, Reporter
+from nerg_mi.tracking_kinds import TRACKING_NOTES
 
 from .measured import AoiContext, TimeWindow, Viewpoints
 from .options import AoiOptions, CountOptions, PredictionOptions, parse_window

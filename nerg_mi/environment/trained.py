@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nerg_mi.errors import NergError
-from nerg_mi.fields.gaze_base import AnyGazeField, read_tracking, tracking_suffix
+from nerg_mi.fields.gaze_base import AnyGazeField, tracking_suffix
 from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.files.atomic import file_sha256
 from nerg_mi.files.html import key_value_table
 from nerg_mi.files.values import FilePath, to_path
 from nerg_mi.formats.fields import load_radiance, save_gaze, save_radiance
 from nerg_mi.rendering.scene import get_array_module
+from nerg_mi.tracking_kinds import read_tracking
 
 Network = TypeVar("Network", RadianceField, AnyGazeField)
 

@@ -16,6 +16,7 @@ from nerg_mi.maths.arrays import to_vector
 from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.maths.types import Bool, Float, Point3f, Vector3f
 from nerg_mi.ranges import MAX_COORDINATE
+from nerg_mi.tracking_kinds import TRACKING_NOTES, read_tracking
 
 from .encoding import HashGrid, HashGridConfig
 from .gaze_hits import ReaimedHits
@@ -28,10 +29,6 @@ if TYPE_CHECKING:
 # ---- Amount of data behind a gaze field: rays and participants ----
 
 _MAX_COUNT = 1 << 60
-
-
-TRACKING_NOTES = {"head": "directions of heads", "mixed": "partly directions of heads"}
-"""What rays that are not all gaze are, by the kind of their tracking (`nerg_mi.rays.rays.TRACKING`)."""
 
 
 @dataclass(frozen=True)
@@ -62,13 +59,6 @@ def summarize_provenance(provenance: Mapping[str, Any]) -> DataSummary | None:
     programs."""
     rays, people, images = (_number(provenance.get(name)) for name in ("rays", "people", "salience_views"))
     return DataSummary(rays or 0, people or None, images or 0, read_tracking(provenance)) if rays or images else None
-
-
-def read_tracking(provenance: Mapping[str, Any]) -> str:
-    """What was tracked in the recordings of a checkpoint's ``provenance``: "eye", "head", "mixed" or "unknown", as in
-    checkpoints of earlier versions."""
-    tracking = provenance.get("tracking")
-    return tracking if isinstance(tracking, str) and tracking in ("eye", *TRACKING_NOTES) else "unknown"
 
 
 def _number(value: object) -> int | None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError, parameter
-from nerg_mi.fields.gaze_base import TRACKING_NOTES
+from nerg_mi.tracking_kinds import TRACKING_NOTES
 
 from .style import (
     DPI,

@@ -15,10 +15,10 @@ from nerg_mi import __version__
 from nerg_mi.evaluation.baselines import PRIOR
 from nerg_mi.evaluation.gaze import SPLIT_HALF
 from nerg_mi.evaluation.gaze_report import SPLIT_LABELS, Comparison, GazeResults, Verdict
-from nerg_mi.fields.gaze_base import read_tracking
 from nerg_mi.files.html import Html, element, figure, image, key_value_table, markup, paragraph, table
 from nerg_mi.rays.quality import WARNING_LABEL, make_quality_report
 from nerg_mi.rays.rays import TRACKING
+from nerg_mi.tracking_kinds import read_tracking
 from nerg_mi.train.radiance_settings import use_current_names
 
 from .charts import Point, interval_chart

@@ -37,7 +37,7 @@ from nerg_mi.evaluation.uncertainty import (
     score_positions,
     summarise_folds,
 )
-from nerg_mi.fields.gaze_base import AnyGazeField, read_tracking, tracking_suffix
+from nerg_mi.fields.gaze_base import AnyGazeField, tracking_suffix
 from nerg_mi.figures.style import existing_files, make_provenance
 from nerg_mi.files.atomic import check_folder, file_sha256, write_text
 from nerg_mi.files.dataframes import ResultTables
@@ -51,6 +51,7 @@ from nerg_mi.rays.dataset import hash_rays, is_dataset, load_rays
 from nerg_mi.rays.rays import TRACKING, Rays
 from nerg_mi.tasks.task import FOLDER_SUFFIX, RENDER_LIBRARIES, Part, Plan
 from nerg_mi.threads import set_thread_count
+from nerg_mi.tracking_kinds import read_tracking
 from nerg_mi.train.gaze_data import find_hit_points
 from nerg_mi.train.gaze_log_density import ELEVATION_PRIOR
 from nerg_mi.train.geometry_files import check_geometry, geometry_kind, load_training_geometry

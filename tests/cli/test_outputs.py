@@ -17,6 +17,8 @@ import pytest
 
 import nerg_mi.cli
 from nerg_mi.cli.building import find_commands, make_callback
+from nerg_mi.cli.signatures import make_command
+from nerg_mi.cli.table import ROWS
 from nerg_mi.workflows.base import COMMANDS
 
 from .outputs import CASES, INPUTS, MAKES_A_FOLDER, OF_TORCH
@@ -184,13 +186,14 @@ def commands() -> dict:
     """The function of each command of `nerg`, by its full name."""
     for entry in find_commands().values():
         importlib.import_module(entry.module)
-    return {name: make_callback(command) for name, command in COMMANDS.items()}
+    made = COMMANDS | {name: make_command(row) for name, row in ROWS.items()}
+    return {name: (make_callback(command), command.parameters) for name, command in made.items()}
 
 
-def path_options(name: str, command) -> dict[str, tuple]:
+def path_options(command, parameters) -> dict[str, tuple]:
     """Path parameters of a command, and their options; arguments are inputs."""
     out = {}
-    arguments = {key for key, parameter in COMMANDS[name].parameters.items() if not parameter.names}
+    arguments = {key for key, parameter in parameters.items() if not parameter.names}
     for key, hint in get_type_hints(command, include_extras=True).items():
         kind, *annotations = get_args(hint) or (hint,)
         if key not in arguments and Path in (kind, *get_args(kind)):
@@ -210,7 +213,7 @@ def test_every_output_option_has_a_case(tmp_path):
         if name in MAKES_A_FOLDER:
             continue
         lines = [c.arguments(tmp_path, tmp_path) for c in CASES if c.name == name]
-        options, read = path_options(name, command), INPUTS.get(name, set())
+        options, read = path_options(*command), INPUTS.get(name, set())
         assert read <= set(options), f"{name} has no such option"
         for parameter in set(options) - read:
             assert any(option in line for line in lines for option in options[parameter]), (

@@ -81,7 +81,7 @@ LINES = {
     "scene a.obj -o {o}/a.xml --observer 1,2": "--observer must be three numbers",
     "render scene.xml -o {o}/a.bmp": r"choose a file name that ends in \.exr or \.png",
     "render scene.xml -o {o}/a.exr -s 7": r"has 2 sensor\(s\), and index 7 is out of range",
-    "render scene.xml -o {o}/a.exr -D level": "write -D KEY=VALUE",
+    "render scene.xml -o {o}/a.exr -D level": "write KEY=VALUE",
     "render scene.xml -o {o}/a.exr -D integrator=nope": '"nope" not found',
     "render scene.xml -o {o}/a.exr -D levle=2": r'does not use "\$levle"; correct the name',
     "render scene.xml -o {o}/a.exr -m scalar_rgb -s 1": '"panorama" needs a variant with',
@@ -116,7 +116,7 @@ LINES = {
     "poses photos/0.png -o {o}/a": "is a single photo",
     "poses photos/nowhere -o {o}/a": "there is no video",
     "poses empty -o {o}/a": "contains no photos",
-    "poses photos -o {o}/a --camera-model fish": "lens must be auto, radial, opencv",
+    "poses photos -o {o}/a --camera-model fish": "--camera-model must be",
     "poses photos -o photos": "not empty: choose another name, or remove it",
     "poses photos -o rays.npz": "is a file",
 }

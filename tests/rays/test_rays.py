@@ -148,8 +148,8 @@ def stored(path, **changes):
 @pytest.mark.parametrize(
     "changes, why",
     [
-        ({"person": np.full(9, -1)}, "unknown person"),
-        ({"person": np.full(9, 1 << 32)}, "unknown person"),
+        ({"person": np.full(9, -1)}, "unknown participant"),
+        ({"person": np.full(9, 1 << 32)}, "unknown participant"),
         ({"person": np.zeros(9)}, "person is not integers"),
         ({"direction": np.full((9, 3), np.inf)}, "direction that is not finite"),
         ({"origin": np.zeros((9, 2))}, r"origin has shape \(9, 2\)"),
@@ -360,7 +360,7 @@ def broken(name, row, value):
         (broken("origin", 1, 1e38), r"beyond 1e\+07 m \(rays 1\)"),
         ({"hit": np.full((6, 3), -1e8)}, r"a hit point beyond 1e\+07 m \(rays 0, 1"),
         (broken("t", 5, np.nan), r"time that is not finite \(rays 5\)"),
-        (broken("person", 0, 7), r"unknown person \(rays 0\)"),
+        (broken("person", 0, 7), r"unknown participant \(rays 0\)"),
         (broken("confidence", 0, 1.5), r"confidence outside \[0, 1\]"),
         ({"head": np.tile([[0.0, 0, 2], [np.nan, 0, 0]], (3, 1))}, r"head that is not of unit length \(rays 0, 2, 4\)"),
         ({"origin": np.zeros((5, 3))}, r"origin has shape \(5, 3\)"),

@@ -171,7 +171,7 @@ def test_a_report_of_a_gaze_field_alone(not_evaluated, tmp_path):
         "No evaluation was given",
         "No gaze samples were given, so the report has no data-quality section. The field was trained on",
         "positions are unknown",
-        "No AOIs were given. Name a file of AOIs with aois=FILE.json.",
+        "No AOIs were given. Name a file of AOIs.",
     ):
         assert sentence in text
     assert "there is no evaluation" in recorder.messages[0] and packed_scene(text)["marks"] == 1

@@ -100,7 +100,7 @@ def test_proposal_combines_local_gaze_with_the_head(tmp_path, kind):
     path = write(tmp_path / "t.csv", columns)
     proposal = propose_import(path)
     assert proposal.columns is not None and proposal.columns.origin == tuple(f"HMD_position_{a}" for a in "xyz")
-    assert ("radians" in proposal.options) == (kind == "radians")
+    assert ("--radians" in proposal.options) == (kind == "radians")
     options = {"up": proposal.options["--up"], "handedness": proposal.options["--hand"], "radians": kind == "radians"}
     forward = proposal.options.get("--forward")
     assert forward in (None, "z")
