@@ -98,7 +98,7 @@ def _to_array(values: Any, name: str) -> tuple[np.ndarray, np.ndarray | None]:
     try:
         return np.asarray(values), None
     except (TypeError, ValueError, OverflowError) as error:
-        raise NergError(f"{name} must be an array of equal rows, got {type(values).__name__} ({error})") from error
+        raise NergError(f"{name} must be an array of equal rows, got {type(values).__name__}") from error
 
 
 def _fill(array: np.ndarray, missing: np.ndarray | None, dtype: DTypeLike) -> np.ndarray:

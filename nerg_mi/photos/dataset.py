@@ -488,7 +488,8 @@ def _check_depth(posed: PosedImages, views: list[PhotoView]) -> None:
         if background is not None and background.fraction > 0.5:
             raise NergError(
                 f'the depth of "{posed.path}" shows hardly any surface, {background}; render the depth again so that '
-                f"it shows the scene, or disable depth with {parameter('depth', False)}"
+                'it shows the scene, correct "depth_unit_scale_factor" if these are surfaces, or disable depth with '
+                f"{parameter('depth', False)}"
             )
         raise NergError(
             f'the depth of "{posed.path}" does not match its cameras: {reason}; correct "depth_unit_scale_factor", '

@@ -116,7 +116,8 @@ def compile_field(
             except NergError as error:
                 if result is None:
                     raise
-                reporter.warn(f"{error.message}; the field is compiled at a resolution that does not reach the aims")
+                reached = result.provenance["compiled"]["resolution"]
+                reporter.warn(f"{error.message}; the field is compiled at {reached}, which does not reach the aims")
                 break
             compiled = attach_voxels(network, voxels)
             pixels, compiled_seconds = _render(compiled, rays)

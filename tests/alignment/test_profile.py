@@ -18,6 +18,7 @@ from nerg_mi.alignment.similarity import (
     vertical_rotation,
 )
 from nerg_mi.alignment.tracking import Tracking
+from nerg_mi.errors import NergError
 from tests.alignment import rooms
 
 RAYS = replace(rooms.people(200), hit=None)
@@ -84,9 +85,10 @@ def test_the_seed_draws_the_resamples():
 def test_reason_names_what_is_undetermined_and_the_remedy():
     assert Interval((-4, 5), (0.99, 1.01), 0.3).rejection_reason() == ""
     reason = Interval((-50, 130), (0.5, 1.5), 3.0).rejection_reason()
-    for text in ("--turn", "--scale", "--shift", "--pairs", "-50", "+130", "0.5", "1.5", "3 m"):
+    assert set(NergError(reason).parameters) == {"turn", "scale", "shift", "pairs"}
+    for text in ("-50", "+130", "0.5", "1.5", "3 m"):
         assert text in reason
-    assert "scale" not in Interval((-50, 130), (1, 1), 0.3).rejection_reason()
+    assert "scale" not in NergError(Interval((-50, 130), (1, 1), 0.3).rejection_reason()).parameters
 
 
 def test_objective_of_the_groups_sums_to_that_of_the_refinement():

@@ -138,7 +138,7 @@ def _make_radiance_run(folder: Path) -> None:
     from nerg_mi.train.radiance_run import save_run
     from nerg_mi.train.radiance_trainer import RadianceTrainer
 
-    trainer, row = _trainer(RadianceTrainer), {"steps": 3, "psnr": 20.0}
+    trainer, row = _trainer(RadianceTrainer), {"steps": 3, "seconds": 1.0, "psnr": 20.0, "every_pixel": 1}
     trainer.keep_if_best(row)
     save_run(trainer, folder / "field.run", _METADATA, [row])
 
@@ -151,11 +151,11 @@ def _read_radiance_run(folder: Path) -> object:
 
 
 def _make_gaze_run(folder: Path) -> None:
-    from nerg_mi.train.gaze_trainer import GazeRunFile
+    from nerg_mi.train.gaze_trainer import GazeFit, GazeRunFile
     from nerg_mi.train.trainer import Trainer
 
-    trainer = _trainer(Trainer)
-    GazeRunFile(folder / "gaze.run", _METADATA).save("fit", trainer, {"best": 1.5}, trainer.averaged, force=True)
+    trainer, fit = _trainer(Trainer), GazeFit(best_step=2, schedule=5)
+    GazeRunFile(folder / "gaze.run", _METADATA).save("fit", trainer, fit.to_dict(), trainer.averaged, force=True)
 
 
 def _read_gaze_run(folder: Path) -> object:

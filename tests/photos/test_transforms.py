@@ -129,7 +129,7 @@ def test_unusable_frames_are_listed_with_reasons(write):
         "frame 6": "file_path",
         "gone.png": "does not exist",
         "i.png": "fl_x",
-        "j.png": "4 x 4",
+        "j.png": "its pose",
         "k.png": "mask_path",
         "..\\..\\etc\\hostname": "outside of the data set's folder",
     }.items():

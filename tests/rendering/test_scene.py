@@ -316,7 +316,7 @@ def test_other_entry_points_are_checked(standins, tmp_path):
     (tmp_path / "s.xml").write_text(scene(DEEP))
     with pytest.raises(NergError, match="deep"):
         Environment.open(tmp_path / "s.xml")
-    with pytest.raises(NergError, match="there is no scene file"):
+    with pytest.raises(NergError, match="there is no file"):
         Environment.open(tmp_path / "missing.xml")
     with pytest.raises(NergError, match="deep"):
         study_subject.load_subject(tmp_path / "s.xml", 8, 8, {})

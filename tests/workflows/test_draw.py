@@ -432,7 +432,7 @@ def test_fixations_are_numbered_where_they_are(rgb, tmp_path):
     magnification = np.ptp(axes.get_xlim()) / 60
     assert magnification == 1 and np.allclose([t.xy for t in axes.texts[:2]], expected, atol=0.05)
     assert "1 outside of the image or hidden" in " ".join(axes.figure.texts[0].get_text().split())
-    for refused, said in ((dict(participants="Eve"), "Eve"), (dict(start=9.0), "start"), (dict(scene=None), "--scene")):
+    for refused, said in ((dict(participants="Eve"), "Eve"), (dict(start=9.0), "start"), (dict(scene=None), "scene")):
         with pytest.raises(NergError, match=said):
             draw("scanpath", tmp_path / "rays.npz", **(options | refused))
 

@@ -41,18 +41,21 @@ def test_import_by_map(tmp_path):
     "arguments, message",
     [
         ([], "the format of the files is not given"),
-        (["--preset", "vr_supermarket", "--up", "y"], "leave out --up"),
-        ([*MAP, "--marker", 0.05], "--marker belongs to a preset"),
-        ([*MAP, "--salt", "salt"], "--salt needs --pseudonyms"),
-        (["--preset", "skeleton", "--keypoints", "1,2"], "--keypoints needs three"),
-        (["--preset", "skeleton", "--tick", 0], "--tick"),
-        (["--preset", "skeleton", "--tick", "nan"], "--tick"),
+        (["--preset", "vr_supermarket", "--up", "y"], "up"),
+        ([*MAP, "--marker", 0.05], "marker"),
+        ([*MAP, "--salt", "salt"], "salt"),
+        (["--preset", "skeleton", "--keypoints", "1,2"], "keypoints"),
+        (["--preset", "skeleton", "--tick", 0], "tick"),
+        (["--preset", "skeleton", "--tick", "nan"], "tick"),
     ],
 )
 def test_contradictory_options_are_refused(tmp_path, arguments, message):
     (tmp_path / "a.csv").write_text("x\n")
     done = run("import", tmp_path / "a.csv", "-o", tmp_path / "r.npz", *arguments)
-    assert done.exit_code != 0 and message in str(done.exception)
+    assert done.exit_code != 0
+    assert (
+        next(iter(done.exception.parameters)) == message if message.isidentifier() else message in str(done.exception)
+    )
 
 
 def test_import_of_heads_and_their_options(tmp_path):
@@ -87,7 +90,7 @@ def test_one_truncated_line_in_many_files_is_allowed(tmp_path):
     command = ["import", *files, "-o", tmp_path / "r.npz", *MAP, *UNITY]
     done = run(*command)
     assert isinstance(done.exception, NergError) and "p2.csv, line 152: 3 cells" in str(done.exception)
-    assert "--skip-bad-lines" in str(done.exception) and not (tmp_path / "r.npz").exists()
+    assert "skip_bad_lines" in done.exception.parameters and not (tmp_path / "r.npz").exists()
     done = run(*command, "--skip-bad-lines")
     assert done.exit_code == 0, done.output
     rays = Rays.load(tmp_path / "r.npz")

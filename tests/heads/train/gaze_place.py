@@ -38,8 +38,15 @@ register_recipe(
         make_config=lambda choices: PlaceConfig(variant=choices.variant),
         trainer=PlaceTrainer,
         losses=("likelihood",),
-        settings={"steps": 12, "zones": 0, "loss": "likelihood", "integral": 0.0, "probes": 8, "mix_folds": 2},
-        probes={"radius": 0.5, "count": 16, "min_rays": 8, "directions": 64},
-        supported_options=frozenset({"mix-folds", "mix-kappa"}),
+        settings={
+            "steps": 12,
+            "validation_zones": 0,
+            "loss": "likelihood",
+            "integral_weight": 0.0,
+            "probes": 8,
+            "prior_folds": 2,
+        },
+        probes={"radius": 0.5, "probes": 16, "min_rays": 8, "directions": 64},
+        supported_options=frozenset({"prior-folds", "prior-kappa"}),
     )
 )

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from nerg_mi.errors import NergError
 from nerg_mi.probes.probes import place_probes
 from tests.rays.readers.examples import SUPERMARKET, arett, csv, dropped, openxr, quest, read, sranipal, xyz
+from tests.refusals import mentions
 
 N = 12
 RNG = np.random.default_rng(7)
@@ -266,7 +267,7 @@ def test_unity_local_and_head(tmp_path):
 def test_unity_missing_columns_are_reported(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text("time,gaze_origin_x,gaze_origin_y,gaze_origin_z\n0,0,0,0\n")
-    with pytest.raises(NergError, match="no columns gaze_dir_{x,y,z} or .*name columns with columns"):
+    with pytest.raises(NergError, match="no columns gaze_dir_{x,y,z} or ", check=mentions("columns")):
         read("unity", path)
     head = "gaze_origin_x,gaze_origin_y,gaze_origin_z,gaze_dir_x,gaze_dir_y,gaze_dir_z"
     path.write_text(head + "\n0,0,0,0,0,1\n")

@@ -101,7 +101,7 @@ def test_format_is_added_by_one_object(tmp_path, made_up):
     done = run(*command, "--tick", 1e-3, "--blinks")
     assert done.exit_code == 0 and len(Rays.load(tmp_path / "r.npz")) == 2
     assert "name the file of the heads (--heads)" in str(run(*command[:6]).exception)
-    assert "leave out --up" in str(run(*command, "--up", "y").exception)
+    assert "up" in run(*command, "--up", "y").exception.parameters
     assert "made_up" in run("import", "--help").output
     shown = " ".join(run("import", "--preset", "made_up", "--help").output.split())
     assert "What a unit of the heads' places is, in metres." in shown
