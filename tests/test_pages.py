@@ -463,7 +463,7 @@ SMALLER = {
     "nerg eval": "--min-rays 4",
     "nerg scene": "--width 36",
     "nerg report": "--width 36 --spp 1 --max-points 500",
-    "nerg stats": "--viewpoints 8 --directions 256 --resamples 199",
+    "nerg stats": "--viewpoints 8 --resamples 199",
 }
 """What is added to a command, so that it takes a second."""
 

@@ -274,7 +274,8 @@ def compute_code_digest() -> str:
     folders = []
     for package in _CODE_PACKAGES:
         spec = importlib.util.find_spec(package)
-        folders += [(package, Path(location)) for location in (spec and spec.submodule_search_locations) or ()]
+        # In a checkout, the second location of the package is the root, with tests and the environment.
+        folders += [(package, Path(folder)) for folder in list((spec and spec.submodule_search_locations) or ())[:1]]
     return compute_sources_digest(folders)
 
 

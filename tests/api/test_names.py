@@ -109,7 +109,12 @@ def rays():
 LONG = {"folds", "next_look", "report", "study", "train_radiance"}
 
 # Modules that an example needs, and the extras that install them.
-EXTRAS = {"view": ("viser", "viewer"), "export_scene": ("pxr", "usd")}
+EXTRAS = {
+    "export_mesh": ("skimage", "mesh"),
+    "export_scene": ("pxr", "usd"),
+    "find_poses": ("pycolmap", "poses"),
+    "view": ("viser", "viewer"),
+}
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.nightly] * (n in LONG)) for n in nerg.__all__])

@@ -377,7 +377,7 @@ def test_a_quick_study_runs(tmp_path, nerg):
         assert (out / name).is_file() and str(out / name) in ended.out.replace("\n", "")
     with (out / "study.csv").open() as f:
         rows = list(csv.DictReader(f))
-    assert tuple(rows[0]) == COLUMNS
+    assert tuple(rows[0]) == (*COLUMNS, "note")
     by_name = {r["setting"]: r for r in rows}
     default = by_name["default"]
     assert float(default["seconds"]) > 0 and float(default["density_evals"]) > 100 and float(default["peak_mb"]) > 0
