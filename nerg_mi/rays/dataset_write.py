@@ -639,7 +639,7 @@ def _check_compatible(folder: Path, recipe: ImportRecipe) -> None:
         remedy = (
             f"leave out {parameter('pseudonyms', True)}"
             if head.salt is None
-            else f"use the same {parameter('pseudonyms', True)} {parameter('salt', 'FILE')}"
+            else f"use {parameter('pseudonyms', True)} and the same {parameter('salt', 'FILE')}"
         )
         raise NergError(f'participants would get other names than those in "{folder}": {remedy}')
 

@@ -161,8 +161,8 @@ def test_import_with_pseudonyms(tmp_path):
 @pytest.mark.parametrize(
     "before, after, remedy",
     [
-        ({"key": bytes(16)}, {}, "same pseudonyms salt"),
-        ({"key": bytes(16)}, {"key": bytes(range(16))}, "same pseudonyms salt"),
+        ({"key": bytes(16)}, {}, "the same salt"),
+        ({"key": bytes(16)}, {"key": bytes(range(16))}, "the same salt"),
         (
             {"key": bytes(16), "is_salt_stored": False},
             {"key": bytes(16), "is_salt_stored": False},
