@@ -486,3 +486,10 @@ def test26_old_driver_is_reported(monkeypatch, version, old):
     monkeypatch.setattr(diagnosis, "try_backend", lambda backend: {**WORKS, "version": version})
     monkeypatch.setattr(llvm, "has_cuda", lambda: True)
     assert ("R570" in str(diagnosis.run_diagnosis())) is old
+
+
+def test_all_packages_are_installed():
+    """A package that is missing in the list works in a checkout, and is not part of a wheel."""
+    listed = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    folders = {".".join(path.parent.relative_to(ROOT).parts) for path in (ROOT / "nerg_mi").rglob("__init__.py")}
+    assert [name for name in sorted(folders) if f'"{name}",' not in listed] == []
