@@ -62,7 +62,7 @@ def compile_field(
     Parameters
     ----------
     field : TrainedField or path
-        Radiance field (.safetensors). The object is not changed.
+        Radiance field (.safetensors).
     resolution : int
         Number of voxels along the longest edge of the field's bounding box, a multiple of 8. 0: double it from 256 on
         until both errors are below their limits.

@@ -23,7 +23,7 @@ def refine_field(
     Parameters
     ----------
     field : TrainedField or path
-        Radiance field (.safetensors). The object is not changed.
+        Radiance field (.safetensors).
     progress : bool, Reporter or None
         Progress and messages (`nerg_mi.progress.Progress`).
 
