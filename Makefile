@@ -19,14 +19,12 @@
 #   make fuzz      pass 20,000 damaged files to the readers and count the outcomes (about ten minutes)
 #   make faults    kill commands at moments spread over their run and check that nothing is lost
 #   make soak      render and train for thousands of frames and steps and check that memory does not grow
-#   make bench     time frames and stages, and measure memory and start-up next to peers (under ten minutes);
+#   make bench     time frames and stages next to peers (under ten minutes);
 #                  ARGS=--long adds more
 #   make bench-gpu the same on a CUDA device, if there is one
 #   make packages  build the packages, then install and test them with every Python found (nox)
 #
-# The set-up runs once; later calls only do their own work. `make fuzz`, `make faults` and `make bench` print tables;
-# ARGS="--update docs/explanation/robustness.md" writes those of the first two into that page, and
-# ARGS="--update docs/explanation/performance.md" those of the third.
+# The set-up runs once; later calls only do their own work. `python -m tools.results NAME` publishes a result again.
 
 # Tests start many processes: byte code that is kept spares each of them compiling the package, and pytest its rewriting.
 export PYTHONDONTWRITEBYTECODE =

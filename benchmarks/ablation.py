@@ -1,6 +1,6 @@
 """Ablation: variants of a gaze field trained alike, scored on training positions and on held-out positions.
 
-    python benchmarks/ablation.py RAYS [--geometry ENVIRONMENT] [--recipes default,paper] [--variant VARIANT]
+    python benchmarks/ablation.py RAYS [--environment ENVIRONMENT] [--recipes default,paper] [--variant VARIANT]
         [--test-participants 0.5] [--seeds 3] [--steps N] [--out out/benchmarks/ablation]
 
 The variants of a recipe are emit, capture and their product, the other losses that it supports and, in a radiance
@@ -23,11 +23,13 @@ from itertools import product
 from pathlib import Path
 
 import nerg_mi as nerg
+from nerg_mi.cli.declarations import select_backend
 from nerg_mi.evaluation.gaze import compute_map_scores, make_test, select_held_out_rays
 from nerg_mi.files.tables import write_json
-from nerg_mi.train.gaze_data import digest_rays, hold_out
-from nerg_mi.train.gaze_recipes import get_recipe
-from timing import print_table, write_rows
+from nerg_mi.train.gaze_data import digest_rays
+from nerg_mi.train.gaze_folds import hold_out
+from nerg_mi.train.gaze_recipes import Recipe, get_recipe
+from timing import save_result
 
 import numpy as np
 
@@ -36,18 +38,22 @@ COLUMNS = ("train_relative", "test_relative", "train_loss", "test_loss", "test_K
 COLUMNS += ("train_seconds", "frame_seconds")
 
 
-def list_variants(recipe: str, in_field: bool) -> dict[str, dict]:
+def list_variants(recipe: Recipe, in_field: bool) -> dict[str, dict]:
     """Options of `nerg.train_gaze` by the name of the variant; ``in_field``: whether there is a radiance field."""
-    chosen = get_recipe(recipe)
     out: dict[str, dict] = {name: {"variant": name} for name in ("emit", "capture", WHOLE)}
-    out |= {f"loss {loss}": {"loss": loss} for loss in chosen.losses if loss != chosen.make_gaze_settings().loss}
-    if in_field and "semantic" in chosen.supported_options:
+    change = lambda settings, **options: {
+        "recipe": replace(
+            recipe, options=replace(recipe.options, **options), settings=replace(recipe.settings, **settings)
+        )
+    }
+    out |= {f"loss {loss}": change({"loss": loss}) for loss in recipe.losses if loss != recipe.settings.loss}
+    if in_field and "semantic" in recipe.supported_options:
         for kind in ("accumulated", "snapshot"):
-            out |= {f"semantic {kind}": {"semantic": kind}}
-            out |= {f"semantic {kind}, own too": {"semantic": kind, "semantic_concat": True}}
-    if in_field and "init" in chosen.supported_options:
-        out |= {"begins as the field, frozen": {"init": "field", "freeze": True}}
-        out |= {"begins as the field": {"init": "field"}}
+            out |= {f"semantic {kind}": change({}, semantic=kind)}
+            out |= {f"semantic {kind}, own too": change({}, semantic=kind, semantic_own=True)}
+    if in_field and "init" in recipe.supported_options:
+        out |= {"begins as the field, frozen": change({"freeze": True}, init_from_field=True)}
+        out |= {"begins as the field": change({}, init_from_field=True)}
     return out
 
 
@@ -74,7 +80,7 @@ def train_variant(rays, tests: dict, file: Path, settings: dict) -> dict:
     stored = json.loads(path.read_text()) if path.is_file() and file.is_file() else {}
     if stored.get("same") != same:
         started = time.perf_counter()
-        field = nerg.train_gaze(rays, file, **settings)
+        field = nerg.train_gaze(rays, **settings, output=file)
         row = {"steps": field.provenance["steps"], "train_seconds": time.perf_counter() - started}
         for side, test in tests.items():
             row |= {f"{side}_{k}": v for k, v in score(test, field).items()}
@@ -119,7 +125,9 @@ def main(argv=None) -> list[dict]:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
     add("rays", type=Path, help="Rays file (.npz or .parquet).")
-    add("--geometry", default="hits", help="hits, none, or a field, splats, a scene or a mesh. Default: %(default)s.")
+    add(
+        "--environment", default="hits", help="hits, none, or a field, splats, a scene or a mesh. Default: %(default)s."
+    )
     add("--recipes", default="default,paper", help="Recipes, separated by commas. Default: %(default)s.")
     add("--variant", action="append", default=[], help="Name of a variant to train; can be repeated. Default: all.")
     add("--seeds", type=int, default=1, help="Number of trainings of a variant. Default: %(default)s.")
@@ -137,31 +145,35 @@ def main(argv=None) -> list[dict]:
     add("--timing-size", default="320x180", help="Size of timed frames (paper: 1280x720). Default: %(default)s.")
     add("--threads", type=int, help="Number of CPU threads. Default: all cores.")
     add("--out", type=Path, default=Path("out/benchmarks/ablation"), help="Output folder. Default: %(default)s.")
+    add("--result", default="ablation", help="Name of the result. Default: %(default)s.")
     args = parser.parse_args(argv)
     args.out = args.out.resolve()
     args.out.mkdir(parents=True, exist_ok=True)
+    select_backend("llvm_ad_rgb", args.threads)
     (train, tests), rows = make_tests(nerg.load_rays(args.rays), args), []
     centres = tests["test"].centres
     for recipe in args.recipes.split(","):
         # A prior would make the networks that are compared more alike.
-        common = {"recipe": recipe, "geometry": args.geometry, "prior_folds": 0, "threads": args.threads}
-        common |= {} if args.refit or recipe == "default" else {"refit": False}
-        variants = list_variants(recipe, args.geometry.endswith(".safetensors"))
+        chosen = get_recipe(recipe)
+        if not args.refit and recipe != "default":
+            chosen = replace(chosen, settings=replace(chosen.settings, refit=False))
+        common = {"recipe": chosen, "environment": args.environment, "prior_folds": 0}
+        variants = list_variants(chosen, args.environment.endswith(".safetensors"))
         for name, seed in product(args.variant or variants, range(args.seed, args.seed + args.seeds)):
             file = args.out / f"{recipe}_{name.replace(', ', '_').replace(' ', '_')}_{seed}.safetensors"
             settings = {**common, **variants[name], "seed": seed, "steps": args.steps}
             rows.append(
                 {"recipe": recipe, "variant": name, "seed": seed, **train_variant(train, tests, file, settings)}
             )
-            if args.timing_cameras and args.geometry not in ("hits", "none"):
+            if args.timing_cameras and args.environment not in ("hits", "none"):
                 eyes = centres[np.random.default_rng(0).integers(0, len(centres), args.timing_cameras)]
-                rows[-1]["frame_seconds"] = time_frames(args.geometry, file, eyes, args.timing_size)
+                rows[-1]["frame_seconds"] = time_frames(args.environment, file, eyes, args.timing_size)
         for side in ("train", "test"):
             whole = [r[f"{side}_loss"] for r in rows if (r["recipe"], r["variant"]) == (recipe, WHOLE)]
             for row in (r for r in rows if whole and r["recipe"] == recipe):
                 row[f"{side}_relative"] = row[f"{side}_loss"] / np.mean(whole)
-    write_rows(args.out / "ablation.csv", rows)
-    print_table("Ablation", ("recipe", "variant", "seeds", *COLUMNS), summarise(rows))
+    seeds = ", ".join(map(str, range(args.seed, args.seed + args.seeds)))
+    save_result(args.result, ("recipe", "variant", "seeds", *COLUMNS), summarise(rows), seeds)
     return rows
 
 

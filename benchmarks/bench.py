@@ -1,6 +1,6 @@
-"""All speed measurements in one run: frames, densities, volumes, scaling, memory and start-up time.
+"""Speed of frames, densities and volumes, and its growth with size; `processes.py` measures memory and start-up time.
 
-    python benchmarks/bench.py [--only PARTS] [--long] [--mode llvm_ad_rgb] [--update docs/explanation/performance.md]
+    python benchmarks/bench.py [--only PARTS] [--long] [--mode llvm_ad_rgb]
     [--out out/benchmarks/bench]
 
 The parts are:
@@ -10,12 +10,10 @@ The parts are:
 - ``threads``: that frame on 1, 2, 4, ... threads;
 - ``kde``: kernel densities on the sphere, compared with SciPy;
 - ``volume``: the transmittance of a volume, compared with Mitsuba's `volpath`;
-- ``growth``: the growth of each cost with its size;
-- ``memory``: the peak memory of a frame;
-- ``start``: the time until a command has started.
+- ``growth``: the growth of each cost with its size.
 
 Programs that are compared do the same work, which is checked first, and their runs alternate. The figures are medians
-with quartiles. The benchmark prints tables, writes them as CSV files and a figure, and updates a page of the manual.
+with quartiles. The benchmark prints tables and saves them as results.
 With a CUDA variant, parts without a reference program are measured in wall-clock seconds. Without a CUDA device, the
 benchmark prints a message and ends.
 """
@@ -24,8 +22,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import platform
-import re
 import sys
 from functools import cached_property, partial
 from pathlib import Path
@@ -35,13 +31,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 from collections.abc import Callable
 
 import nerg_mi
-import processes
 import torch_frames
 from nerg_mi.fields.kde import SphericalKde
-from nerg_mi.figures.style import save
 from nerg_mi.llvm import has_cuda
-from nerg_mi.workflows.demo import find_store_scene
-from timing import at_the_end, exponent, in_turns, median, print_table, spread, write_rows
+from nerg_mi.scenes.store import SCENE_FILE
+from timing import at_the_end, exponent, in_turns, median, save_result, spread
 
 import numpy as np
 
@@ -156,10 +150,10 @@ class Run:
 
         import mitsuba as mi
 
-        self.long, self.out, self.page, self.threads = args.long, args.out, args.update, args.threads
+        self.long, self.out, self.threads = args.long, args.out, args.threads
         self.runs = args.runs or (9 if args.long else 5)
         self.cuda = mi.variant().startswith("cuda")
-        folder, ns = find_store_scene().parent, namespace(mi.variant())
+        folder, ns = SCENE_FILE.parent, namespace(mi.variant())
         self.field = load_radiance(folder / "store.safetensors", ns)[0]
         self.gaze = load_gaze(folder / "shoppers.safetensors", ns)[0]
 
@@ -167,42 +161,16 @@ class Run:
     def compiled(self) -> Path:
         """A compiled copy of the store's field, which is made once."""
         path = self.out / "store.compiled.safetensors"
-        nerg_mi.compile_field(find_store_scene().parent / "store.safetensors").save(path)
+        nerg_mi.compile_field(SCENE_FILE.parent / "store.safetensors").save(path)
         return path
 
     def cost(self, times) -> list[float]:
         """Seconds of each run: CPU time, or wall-clock time on a device."""
         return [wall if self.cuda else cpu for wall, cpu in times]
 
-    def table(self, title: str, head: dict[str, str], rows: list[list[str]], name: str) -> None:
-        """Print the table, and write it as CSV; ``head``: name of a column in the CSV file -> its title."""
-        print_table(title, list(head.values()), rows, self.page)
-        write_rows(self.out / f"{name}.csv", [dict(zip(head, row)) for row in rows])
-
-    def figure(self, figure, name: str) -> None:
-        path = (self.page.parents[1] / "images" if self.page else self.out) / f"performance-{name}.png"
-        save(figure, path, {"Software": "benchmarks/bench.py"})
-        print(f"wrote {path}\n")
-
-
-def the_run(run: Run) -> None:
-    """A description of the measurement and the machine."""
-    import drjit
-    import mitsuba as mi
-
-    info = Path("/proc/cpuinfo")
-    name = re.search(r"model name\s*: (.*)", info.read_text()) if info.exists() else None
-    flags = info.read_text() if info.exists() else ""
-    vectors = next((v for k, v in {"avx512f": "AVX-512", "avx2": "AVX2"}.items() if k in flags), "")
-    programs = [f"mitsuba {mi.__version__}", f"drjit {drjit.__version__}", f"numpy {np.__version__}"]
-    rows = [
-        ["processor", " ".join([name[1] if name else platform.processor() or platform.machine(), vectors]).strip()],
-        ["threads", str(run.threads)],
-        ["variant", mi.variant()],
-        ["programs", ", ".join(programs)],
-        ["runs of each", str(run.runs)],
-    ]
-    run.table("The run", {"what": "property", "with": "value"}, rows, "run")
+    def save(self, name: str, columns: list[str], rows: list[list[str]]) -> None:
+        """Save the result ``name`` of this variant."""
+        save_result(f"{name}-cuda" if self.cuda else name, columns, rows)
 
 
 def peers_of(run: Run, compiled: bool) -> dict[str, torch_frames.TorchRenderer]:
@@ -212,7 +180,7 @@ def peers_of(run: Run, compiled: bool) -> dict[str, torch_frames.TorchRenderer]:
     import torch
 
     torch.set_num_threads(run.threads)
-    scene = nerg.Scene.load(find_store_scene(), **torch_frames.PEER_SCENE)
+    scene = nerg.Scene.load(SCENE_FILE, **torch_frames.PEER_SCENE)
     falloff = float(np.ravel(np.array(scene.integrator.falloff))[0])
     made = {
         "PyTorch, eager": {"model": torch_frames.TorchModel},
@@ -247,8 +215,7 @@ def frames(run: Run) -> None:
         rows += torch_frames.measure(works, f"{width} x {height}", runs)
     titles = {"frame": "image size", "s": "time, s", "quartiles": "quartiles, s", "CPU s": "CPU time, s"}
     titles["times nerg"] = "relative to nerg"
-    head = {key: titles.get(key, key) for key in rows[0]}
-    run.table("Frames", head, [list(map(str, r.values())) for r in rows], "frames")
+    run.save("frames", [titles.get(key, key) for key in rows[0]], [list(map(str, r.values())) for r in rows])
 
 
 def stages(run: Run) -> None:
@@ -276,15 +243,8 @@ def stages(run: Run) -> None:
         clock = 1e6 * median(wall for wall, _ in times) / (width * height)
         cells = [f"{peer / clock:.0f}"] if peer else [""]
         rows.append([name, f"{median(each):.2f}", spread(each), overrides, *cells])
-    unit = "us" if run.cuda else "us of CPU"
-    head = {
-        "what": "computed quantities",
-        f"{unit} a pixel": f"{'time' if run.cuda else 'CPU time'} per pixel, µs",
-        "quartiles": "quartiles, µs",
-        "more than above": "increase over the row above, µs",
-        "times faster than eager PyTorch": "speed-up over eager PyTorch",
-    }
-    run.table("Stages", head, rows, "stages")
+    head = ["computed quantities", f"{'time' if run.cuda else 'CPU time'} per pixel, µs", "quartiles, µs"]
+    run.save("stages", [*head, "increase over the row above, µs", "speed-up over eager PyTorch"], rows)
 
 
 def threads(run: Run) -> None:
@@ -310,8 +270,8 @@ def threads(run: Run) -> None:
         [*name, *(f"{seconds[n][name]:.3g}" for n in counts), f"{seconds[1][name] / seconds[counts[-1]][name]:.2f}"]
         for name in works
     ]
-    head = {"frame": "image size", "renderer": "renderer"} | {f"s, {n}": f"time, {n} threads, s" for n in counts}
-    run.table("Threads", head | {"speed-up": f"speed-up of {counts[-1]} over 1"}, rows, "threads")
+    head = ["image size", "renderer", *(f"time, {n} threads, s" for n in counts)]
+    run.save("threads", [*head, f"speed-up of {counts[-1]} over 1"], rows)
 
 
 def peer_stages(run: Run, width: int, height: int) -> dict[str, float]:
@@ -322,7 +282,7 @@ def peer_stages(run: Run, width: int, height: int) -> dict[str, float]:
     import torch
 
     torch.set_num_threads(run.threads)
-    scene = nerg.Scene.load(find_store_scene(), **torch_frames.PEER_SCENE)
+    scene = nerg.Scene.load(SCENE_FILE, **torch_frames.PEER_SCENE)
     falloff = float(np.ravel(np.array(scene.integrator.falloff))[0])
     peer = torch_frames.TorchRenderer(run.field, run.gaze, falloff, torch_frames.TorchModel)
     o, d = torch_frames.camera_rays(width, height)
@@ -355,14 +315,8 @@ def kde(run: Run) -> None:
             [f"{rays:,}", *(f"{1e3 * median(c):.3g} ({spread(1e3 * t for t in c)})" for c in (ours, theirs)), times]
         )
         rows[-1].append(f"{difference:.0e}")
-    head = {
-        "rays": "rays",
-        "nerg, CPU ms (quartiles)": "nerg: CPU time (quartiles), ms",
-        "SciPy, CPU ms (quartiles)": "SciPy: CPU time (quartiles), ms",
-        "times": "speed-up",
-        "largest difference": "maximum difference",
-    }
-    run.table("Kernel densities next to SciPy", head, rows, "kde")
+    head = ["rays", *(f"{name}: CPU time (quartiles), ms" for name in ("nerg", "SciPy"))]
+    run.save("kde", [*head, "speed-up", "maximum difference"], rows)
 
 
 def volume(run: Run) -> None:
@@ -383,63 +337,26 @@ def volume(run: Run) -> None:
         ]
         for name, cost in costs.items()
     ]
-    head = {
-        "renderer": "renderer",
-        "CPU ms": "CPU time, ms",
-        "quartiles": "quartiles, ms",
-        "error (rms)": "RMS error",
-        "times at equal error": "relative cost at equal error",
-    }
-    run.table("A cloud that absorbs, next to `volpath`", head, rows, "volume")
+    head = ["renderer", "CPU time, ms", "quartiles, ms", "RMS error", "relative cost at equal error"]
+    run.save("volume", head, rows)
 
 
 def growth(run: Run) -> None:
     import sizes
 
-    rows, curves = [], []
+    rows = []
     for result in sizes.growths(run.long):
         taken = in_turns({str(n): work for n, work in result.works.items()}, run.runs, warm=2)
         counts, costs = list(result.works), [run.cost(times) for times in taken.values()]
         middle = [1e3 * median(c) for c in costs]
-        low, high = np.transpose([1e3 * np.quantile(c, (0.25, 0.75)) for c in costs])
-        fitted = exponent(counts, middle)
-        curves.append(
-            {
-                "title": result.what.replace("`", ""),
-                "axis": result.axis,
-                "sizes": counts,
-                "low": low,
-                "middle": middle,
-                "high": high,
-                "exponent": fitted,
-                "unit": "ms" if run.cuda else "CPU ms",
-            }
-        )
         steps = ", ".join(f"{n:,}: {c:,.0f}" if c >= 1e3 else f"{n:,}: {c:.3g}" for n, c in zip(counts, middle))
         last = f"{at_the_end(counts, middle):.2f}"
-        rows.append([result.what, result.axis, steps, f"{fitted:.2f}", last, result.aim])
-    unit = "ms" if run.cuda else "CPU ms"
-    head = {
-        "cost": "computation",
-        "against": "size",
-        f"{unit} by size": f"{'time' if run.cuda else 'CPU time'} by size, ms",
-        "exponent": "exponent",
-        "between the two largest": "exponent between the two largest",
-        "aim": "target exponent",
-    }
-    run.table("Growth", head, rows, "growth")
-    run.figure(sizes.growth_figure(curves), "growth")
+        rows.append([result.what, result.axis, steps, f"{exponent(counts, middle):.2f}", last, result.aim])
+    head = ["computation", "size", f"{'time' if run.cuda else 'CPU time'} by size, ms", "exponent"]
+    run.save("growth", [*head, "exponent between the two largest", "target exponent"], rows)
 
 
-def memory(run: Run) -> None:
-    run.table("Memory", processes.HEADS["memory"], processes.memory(), "memory")
-
-
-def start(run: Run) -> None:
-    run.table("Start", processes.HEADS["start"], processes.start(run.runs), "start")
-
-
-PARTS = {part.__name__: part for part in (frames, stages, threads, kde, volume, growth, memory, start)}
+PARTS = {part.__name__: part for part in (frames, stages, threads, kde, volume, growth)}
 
 
 def main(argv=None) -> None:
@@ -465,11 +382,6 @@ def main(argv=None) -> None:
     )
     parser.add_argument("-m", "--mode", default="llvm_ad_rgb", help="Mitsuba variant. Default: %(default)s.")
     parser.add_argument(
-        "--update",
-        type=Path,
-        help="Page of the manual whose tables below the same headings are replaced. Default: none.",
-    )
-    parser.add_argument(
         "--out", type=Path, default=Path("out/benchmarks/bench"), help="Folder for the results. Default: %(default)s."
     )
     args = parser.parse_args(argv)
@@ -486,7 +398,6 @@ def main(argv=None) -> None:
 
     dr.set_thread_count(args.threads)
     run = Run(args)
-    the_run(run)
     for name in requested:
         PARTS[name](run)
 

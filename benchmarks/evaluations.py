@@ -1,7 +1,7 @@
 """Density evaluations of a frame, and the time and error of each setting that saves some of them.
 
     python benchmarks/evaluations.py SCENE.xml [-D KEY=VALUE] [--width 640] [--height 360] [--repeats 7]
-    [--compiled FIELD.safetensors] [--out out/benchmarks/evaluations.csv] [--update docs/explanation/error-and-time.md]
+    [--compiled FIELD.safetensors]
 
 Each row of the table is the scene with some parameters of the integrator. Errors and speed-ups are relative to the
 first row, which marches all occupied cells and each observer ray to its end. With --compiled (repeatable) the rows are
@@ -50,7 +50,7 @@ COMPILED_HEAD = (*HEAD, "depth error, median, mm", "visibility differs by over 0
 
 
 def main(argv=None) -> None:
-    from timing import print_table, write_rows
+    from timing import save_result
 
     import mitsuba as mi
 
@@ -71,17 +71,6 @@ def main(argv=None) -> None:
     parser.add_argument("--height", type=int, default=360, help="Height of the image in pixels. Default: %(default)s.")
     parser.add_argument(
         "--repeats", type=int, default=7, help="Number of timed frames of each row. Default: %(default)s."
-    )
-    parser.add_argument(
-        "--out",
-        type=Path,
-        default=Path("out/benchmarks/evaluations.csv"),
-        help="CSV file to write. Default: %(default)s.",
-    )
-    parser.add_argument(
-        "--update",
-        type=Path,
-        help="Page of the manual whose tables below the same headings are replaced. Default: none.",
     )
     parser.add_argument(
         "--compiled", type=Path, action="append", default=[], help="Compiled copy of the scene's field. Default: none."
@@ -132,7 +121,6 @@ def main(argv=None) -> None:
             times.append(time.process_time() - started)
     for row, times in zip(rows, taken):
         row["us"] = 1e6 * statistics.median(times) / pixels
-    write_rows(args.out, rows)
     shown = [
         [
             r["setting"],
@@ -148,8 +136,8 @@ def main(argv=None) -> None:
         ]
         for r in rows
     ]
-    title, head = ("Compiled fields", COMPILED_HEAD) if args.compiled else ("Evaluations", HEAD)
-    print_table(f"{title}, {subject.name}", head, shown, args.update)
+    name, head = ("compiled-fields", COMPILED_HEAD) if args.compiled else ("evaluations", HEAD)
+    save_result(name, head, shown)
 
 
 if __name__ == "__main__":

@@ -1,15 +1,16 @@
 """Events and data quality of recordings, next to those of other libraries on the same samples.
 
-    python benchmarks/gaze_events.py [--data DIR] [--out out/benchmarks/gaze_events]
+    python benchmarks/gaze_events.py [--data DIR]
 
 Needs ``pip install ETDQualitizer pymovements eyedentify3d``. One participant each of the supermarket (50 Hz) and of two
 EyeNavGS scenes (71 Hz):
 
-- Data quality: those of `nerg_mi.rays.quality.measure_recordings`, and ETDQualitizer's for the same angles.
-- Fixations by velocity: the samples of `nerg_mi.rays.events.detect_fixations_ivt`, and of pymovements' I-VT for the
+- Data quality: those of `nerg_mi.tracking.quality.measure_recordings`, and ETDQualitizer's for the same angles.
+- Fixations by velocity: the samples of `nerg_mi.tracking.events.detect_fixations_ivt`, and of pymovements' I-VT for the
   same velocities. There a sample has the velocity of the step before it, so that an event begins one sample later: its
   minimum duration is set one interval shorter.
-- Events: those of `nerg_mi.rays.events.detect_events`, and EyeDentify3D's. Cohen's kappa over samples, and the fraction
+- Events: those of `nerg_mi.tracking.events.detect_events`, and EyeDentify3D's. Cohen's kappa over samples, and the
+fraction
   of saccades that overlap one of the other method. Pauses are filled with invalid samples for EyeDentify3D.
 """
 
@@ -19,11 +20,11 @@ import argparse
 import os
 from pathlib import Path
 
-from nerg_mi.rays.events import Events, angles_about, detect_events, detect_fixations_ivt, measure_velocities
-from nerg_mi.rays.quality import measure_recordings
-from nerg_mi.rays.rays import Rays
-from nerg_mi.rays.readers.registry import read_rays
-from timing import print_table, write_rows
+from nerg_mi.tracking.events import Events, angles_about, detect_events, detect_fixations_ivt, measure_velocities
+from nerg_mi.tracking.quality import measure_recordings
+from nerg_mi.tracking.rays import Rays
+from nerg_mi.tracking.readers.registry import read_rays
+from timing import save_result
 
 import numpy as np
 
@@ -174,8 +175,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     default = Path(os.environ.get("NERG_DATA", ROOT.parent / "shared" / "data"))
     parser.add_argument("--data", type=Path, default=default, help="Folder of the recordings.")
-    parser.add_argument("--page", type=Path, help="Page of the manual whose tables are replaced.")
-    parser.add_argument("--out", type=Path, default=ROOT / "out" / "benchmarks" / "gaze_events")
     arguments = parser.parse_args()
     quality, fixations, kinds = [], [], []
     for name, (preset, file) in RECORDINGS.items():
@@ -184,12 +183,10 @@ def main() -> None:
         quality += compare_quality(name, rays, events)
         fixations.append(compare_velocity_threshold(name, rays))
         kinds += compare_events(name, rays, events)
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    tables = {"Data quality": quality, "Fixations by velocity": fixations, "Saccades and slow gaze": kinds}
-    for title, rows in tables.items():
+    tables = {"events-quality": quality, "events-fixations": fixations, "events-kinds": kinds}
+    for name, rows in tables.items():
         cells = [[f"{v:.4g}" if isinstance(v, float) else v for v in row.values()] for row in rows]
-        print_table(title, list(rows[0]), cells, arguments.page)
-        write_rows(arguments.out / f"{title.lower().replace(' ', '_')}.csv", rows)
+        save_result(name, list(rows[0]), cells)
 
 
 if __name__ == "__main__":

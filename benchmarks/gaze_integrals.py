@@ -1,14 +1,11 @@
 """Integral of a normalised gaze field over the sphere, compared with a finer integral at random positions.
 
-    python benchmarks/gaze_integrals.py GAZE PLACE.vol|FIELD.safetensors [--positions 1000] [--out
-    out/benchmarks/gaze_integrals.csv]
+    python benchmarks/gaze_integrals.py GAZE PLACE.vol|FIELD.safetensors [--positions 300]
 
-A normalised field is divided by the integral that the integrator computes for each observer. If this integral is
-accurate, the normalised density integrates to one. The benchmark computes it again with twice as many and other
-directions, at positions that are uniform in the bounding box of the training's head positions. It prints the maximum
-and the mean difference from one, the fraction of positions with a difference of at most 1e-3, and the time of an
-integral. ``--sweep`` prints the same for other numbers of directions, with the largest number as the reference, and for
-tolerances that determine the number of directions.
+A normalised field is divided by the integral that the integrator computes for each observer. The benchmark computes it
+with several numbers of directions, and for tolerances that determine the number of directions, at positions that are
+uniform in the bounding box of the training's head positions. The errors are relative to the integral over the largest
+number of directions.
 """
 
 from __future__ import annotations
@@ -19,14 +16,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
-from nerg_mi.files.tables import format_markdown_table
 
 import numpy as np
 
 
 def main(argv=None) -> None:
-    from timing import write_rows
-
     import drjit as dr
     import mitsuba as mi
 
@@ -45,18 +39,7 @@ def main(argv=None) -> None:
         "place", type=Path, help="Geometry of the environment: a volume (.vol) or the checkpoint of a radiance field."
     )
     parser.add_argument(
-        "--positions", type=int, default=1000, help="Number of random observer positions. Default: %(default)s."
-    )
-    parser.add_argument(
-        "--out",
-        type=Path,
-        default=Path("out/benchmarks/gaze_integrals.csv"),
-        help="CSV file to write. Default: %(default)s.",
-    )
-    parser.add_argument(
-        "--sweep",
-        action="store_true",
-        help="Print errors and times for several numbers of directions and tolerances instead, without a CSV file.",
+        "--positions", type=int, default=300, help="Number of random observer positions. Default: %(default)s."
     )
     args = parser.parse_args(argv)
     ns = namespace("llvm_ad_rgb")
@@ -76,31 +59,17 @@ def main(argv=None) -> None:
         return float(gaze.for_observers([p_o], place, requested).integrals(p_o)[0][0])
 
     low, high = np.array(field.config.heads)
-    rng, rows = np.random.default_rng(0), []
-    if args.sweep:
-        sweep(integral, rng.uniform(low, high, (args.positions, 3)).tolist())
-        return
-    for p in rng.uniform(low, high, (args.positions, 3)).tolist():
-        started = time.perf_counter()
-        ours = integral(p, COUNT)
-        seconds = time.perf_counter() - started
-        fine = integral(p, 2 * COUNT + 13)
-        rows.append({"x": p[0], "y": p[1], "z": p[2], "integral": fine / ours, "seconds": seconds})
-    off = np.abs([r["integral"] - 1 for r in rows])
-    print(
-        f"{len(rows)} positions: mean error {off.mean():.1e}, 99 % quantile {np.quantile(off, 0.99):.1e}, "
-        f"maximum {off.max():.1e}; "
-        f"{np.mean(off <= 1e-3):.1%} within 1e-3; "
-        f"{np.median([r['seconds'] for r in rows]):.3f} s per integral of {COUNT:,} directions (median)"
-    )
-    write_rows(args.out, rows)
+    rng = np.random.default_rng(0)
+    sweep(integral, rng.uniform(low, high, (args.positions, 3)).tolist())
 
 
 TOLERANCES = (5e-3, 2e-3, 1e-3, 3e-4)
 
 
 def sweep(integral, positions: list[list[float]]) -> None:
-    """Print error and time of an integral by its number of directions, and by its tolerance."""
+    """Save error and time of an integral by its number of directions, and by its tolerance."""
+    from timing import save_result
+
     counts = [1 << k for k in range(9, 19)]
     true = np.array([integral(p, (1 << 20) + 13) for p in positions])
     variants = {f"{count:,}": {"count": count} for count in counts}
@@ -117,9 +86,8 @@ def sweep(integral, positions: list[list[float]]) -> None:
         off, (wall, cpu) = np.abs(result[:, 0] / true - 1), 1e3 * np.median(result[:, 1:], axis=0)
         errors = (f"{v:.1e}" for v in (off.mean(), np.quantile(off, 0.99), off.max()))
         rows.append((name, *errors, f"{wall:.0f} ms", f"{cpu:.0f} ms"))
-    print(
-        format_markdown_table(("directions", "mean error", "99 % quantile", "maximum error", "time", "CPU time"), rows)
-    )
+    head = ("directions", "mean error", "99 % quantile", "maximum error", "time", "CPU time")
+    save_result("gaze-integrals", head, rows, "0")
 
 
 if __name__ == "__main__":

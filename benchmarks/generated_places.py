@@ -76,7 +76,7 @@ class GeneratedPlace:
         """Rays of ``people`` participants in ``scene`` (its file), ``seconds`` each. ``targets`` receives, for each
         participant, the weights (N, K) of the targets without preferences, the preferences (K,) and the selected
         targets (N,)."""
-        from nerg_mi.rays.rays import Rays
+        from nerg_mi.tracking.rays import Rays
 
         import mitsuba as mi
 

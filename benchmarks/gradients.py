@@ -1,6 +1,6 @@
 """Derivatives of images compared with central differences, for all quantities and parameters.
 
-    python benchmarks/gradients.py [--depth median] [--case NAME] [--update docs/explanation/numerics.md]
+    python benchmarks/gradients.py [--depth median] [--case NAME]
 
 Each case moves one parameter, or all weights of one kind together, along a fixed line. Forward mode gives the
 derivatives of all pixels, as computed by ``mi.render``. Reverse mode gives the derivative of one weighted sum of the
@@ -21,13 +21,13 @@ from pathlib import Path
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.gaze_base import GazeEnsemble
-from nerg_mi.fields.gaze_product import GazeConfig, GazeField
+from nerg_mi.fields.gaze_product import GazeConfig, ProductHead
 from nerg_mi.fields.mlp import namespace
-from nerg_mi.fields.radiance import RadianceConfig, RadianceField
+from nerg_mi.fields.radiance import RadianceConfig, RadianceNetwork
 from nerg_mi.formats.fields import save_gaze, save_radiance
 from nerg_mi.maths.geometry import Box
 from nerg_mi.transport.mitsuba_mesh import pack_positions, positions_key, unpack_positions
-from timing import print_table
+from timing import save_result
 
 import drjit as dr
 import numpy as np
@@ -59,9 +59,9 @@ def write_fields(mi, folder: Path) -> None:
     ns = namespace(mi.variant())
     rng = np.random.default_rng(0)
     config = RadianceConfig(GRID, width=16, geometry=7, sh_degree=2, density_scale=0.4)
-    radiance = RadianceField.random(config, BOX, ns, 0, march_step=0.1)
+    radiance = RadianceNetwork.random(config, BOX, ns, 0, march_step=0.1)
     gaze, other = (
-        GazeField.random(GazeConfig(GRID, width=16, geometry=7, sh_degree=2), AROUND, ns, seed) for seed in (1, 2)
+        ProductHead.random(GazeConfig(GRID, width=16, geometry=7, sh_degree=2), AROUND, ns, seed) for seed in (1, 2)
     )
     for one in (radiance, gaze, other):
         values = {"grid.table": ns.Float(rng.uniform(0.2, 1.8, len(one.grid.table)).astype(np.float32))}
@@ -282,7 +282,7 @@ def cases() -> list[Case]:
 
 
 # Derivatives that miss a discontinuity: (1), (2), ... refer to the list above the table in
-# docs/explanation/numerics.md.
+# docs/explanation/numerics.md ("Excluded derivatives").
 EXCLUDED = {
     "shape: its silhouette": dict.fromkeys(
         ("colour", "depth", "opacity", "position", "gaze", "emit", "capture", "visibility", "observer depth"),
@@ -391,8 +391,8 @@ def norm(x) -> float:
     return float(np.sqrt(np.sum(np.square(x)))) + 1e-30
 
 
-def errors(mi, only: str, depth: str):
-    """The table of all cases, with surfaces at ``depth``."""
+def errors(mi, only: str, depth: str) -> tuple[list[str], list[list[str]]]:
+    """The columns and rows of all cases, with surfaces at ``depth``."""
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         write_fields(mi, Path(folder))
@@ -406,7 +406,7 @@ def errors(mi, only: str, depth: str):
         if only in name:
             rows.append([name, *(reason.get(q, "") for q in QUANTITIES), "", "", ""])
     head = ["with respect to", *QUANTITIES, "reverse against forward mode", "central differences", "pixels excluded"]
-    yield "Errors of derivatives", head, rows
+    return head, rows
 
 
 def summary(result: dict) -> list[str]:
@@ -430,11 +430,6 @@ def main(argv=None) -> None:
         "--depth", default="median", help="Depth of surfaces: median, expected or refined. Default: %(default)s."
     )
     parser.add_argument("-m", "--mode", default="llvm_ad_rgb", help="Mitsuba variant. Default: %(default)s.")
-    parser.add_argument(
-        "--update",
-        type=Path,
-        help="Page of the manual whose tables below the same headings are replaced. Default: none.",
-    )
     args = parser.parse_args(argv)
 
     import mitsuba as mi
@@ -442,8 +437,7 @@ def main(argv=None) -> None:
     mi.set_variant(args.mode)
     # Mitsuba declares a sensor's pose as not differentiable and warns on each update.
     mi.set_log_level(mi.LogLevel.Error)
-    for title, head, rows in errors(mi, args.case, args.depth):
-        print_table(title, head, rows, args.update)
+    save_result("derivatives", *errors(mi, args.case, args.depth))
 
 
 if __name__ == "__main__":

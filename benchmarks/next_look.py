@@ -6,8 +6,9 @@
 
 **looks** (default): in each fold half of the participants train a gaze field, without three zones, and determine the
 weights of the next look (`nerg eval next`) in these zones, where the other half is scored. Bits per look over the
-position-independent prior: means over folds, and `more`: the next look minus the better of the last look and the field,
-with 95 % of Student's t over folds.
+position-independent prior: means over folds, and `more`: the next look minus the better of the last look and the field
+by the same scores, which favours these, with 95 % of Student's t over folds. The components were chosen on a fold of
+seed 0, without truck, whose participants are scored here in other folds.
 
 For generated scenes, `law` is what the target of the look one elapsed time before adds to the exact gaze field of the
 law of attention, and `law, preferences` what it adds together with the participant's preferences: mutual information of
@@ -21,7 +22,8 @@ The first table is that of `nerg eval next --head`: bits per sample over the pos
 head and the field together minus the head alone. The second compares the field of heads with that of gaze. In ``heads,
 turned and widened`` the field of heads is convolved with the von Mises-Fisher distribution of gaze in the head that
 the training participants have: its mean direction and its concentration. Intervals of 95 % are those of a fold
-over participants (root mean square over folds, which share participants).
+over participants (root mean square over folds, which share participants). The components given the head were chosen on
+the folds of seed 1, which are among the scored ones.
 """
 
 from __future__ import annotations
@@ -31,7 +33,7 @@ from pathlib import Path
 
 from generated_places import NEW_TARGET_PROBABILITY, PLACES, RATE, draw_preferences
 from places import OURS, PRIOR, interval, parse, parse_environments, place_parser, write_place
-from timing import print_table, write_rows
+from timing import save_result
 
 import numpy as np
 
@@ -55,7 +57,7 @@ def main(argv=None) -> None:
 
 def run_looks(args) -> None:
     """Print the table of looks."""
-    from nerg_mi.workflows.base import select_backend
+    from nerg_mi.cli.declarations import select_backend
 
     select_backend("llvm_ad_rgb", args.threads)
     each: list[dict] = []
@@ -63,7 +65,6 @@ def run_looks(args) -> None:
         folder, rays, where = write_place(name, make, args)
         for seed in range(args.seed, args.seed + args.folds):
             each += evaluate(name, folder, rays, where, seed, args.threads)
-    write_rows(args.out / "folds.csv", each)
     bounds = {place.name: place for place in (make() for make in PLACES)}
     rows = []
     for name, elapsed in dict.fromkeys((row["place"], row["elapsed"]) for row in each):
@@ -76,35 +77,39 @@ def run_looks(args) -> None:
             law = compute_law_gain(bounds[name], args.out / name / "scene.xml", elapsed)
             row |= {"law": f"{law[0]:.2f}", "law, preferences": f"{law[1]:.2f}"}
         rows.append(row)
-    write_rows(args.out / "next_look.csv", rows)
     columns = list(dict.fromkeys(key for row in rows for key in row))
-    print_table("The next look", columns, [[row.get(key, "") for key in columns] for row in rows])
+    seeds = ", ".join(map(str, range(args.seed, args.seed + args.folds)))
+    save_result("next-look", columns, [[row.get(key, "") for key in columns] for row in rows], seeds)
 
 
-def train(folder: Path, rays: Path, where: dict, seed: int, threads: int | None) -> Path:
+def train(folder: Path, rays: Path, where: str | Path, seed: int, threads: int | None) -> Path:
     """Train the field of a fold. One that an earlier run trained is used again."""
     from nerg_mi.progress import TerminalReporter
-    from nerg_mi.workflows.gaze_commands import GazeOptions
-    from nerg_mi.workflows.train_gaze import train_gaze
+    from nerg_mi.train.gaze import train_gaze
 
-    gaze = folder / f"{rays.stem}-{where.get('geometry', 'surfaces')}-{seed}.safetensors"
+    gaze = folder / f"{rays.stem}-{where if where in ('hits', 'none') else 'surfaces'}-{seed}.safetensors"
     if not gaze.is_file():
-        options = GazeOptions(**where, test_zones=3, test_participants=0.5, seed=seed, threads=threads)
+        set_up(threads)
         with TerminalReporter() as reporter:
-            train_gaze(rays, gaze, options, reporter)
+            train_gaze(rays, where, test_zones=3, test_participants=0.5, seed=seed, output=gaze, progress=reporter)
     return gaze
 
 
-def evaluate(name: str, folder: Path, rays: Path, where: dict, seed: int, threads: int | None) -> list[dict]:
+def set_up(threads: int | None) -> None:
+    """Activate the variant, with this number of threads."""
+    from nerg_mi.cli.declarations import select_backend
+
+    select_backend("llvm_ad_rgb", threads)
+
+
+def evaluate(name: str, folder: Path, rays: Path, where: str | Path, seed: int, threads: int | None) -> list[dict]:
     """Bits of each method and elapsed time in a fold."""
+    from nerg_mi.evaluation.next_look_scores import next_look
     from nerg_mi.progress import TerminalReporter
-    from nerg_mi.workflows.gaze_commands import NextLookOptions
-    from nerg_mi.workflows.next_look import evaluate_next_look
 
     gaze = train(folder, rays, where, seed, threads)
-    files = {key: value for key, value in where.items() if key in ("scene", "field")}
     with TerminalReporter() as reporter:
-        result = evaluate_next_look(gaze, rays, None, NextLookOptions(**files, threads=threads), reporter)
+        result = next_look(gaze, rays, where, progress=reporter)
     rows: dict[float, dict] = {}
     for row in result.rows:
         rows.setdefault(row["elapsed"], {"place": name, "fold": seed, "elapsed": row["elapsed"]})[row["method"]] = row
@@ -146,8 +151,8 @@ _DIRECTIONS = 1024  # of heads, in a convolution
 
 def run_heads(args) -> None:
     """Print the tables of heads."""
-    from nerg_mi.rays.rays import Rays
-    from nerg_mi.workflows.base import select_backend
+    from nerg_mi.cli.declarations import select_backend
+    from nerg_mi.tracking.rays import Rays
 
     ns = select_backend("llvm_ad_rgb", args.threads)
     scores_of_head: list[dict] = []
@@ -160,24 +165,21 @@ def run_heads(args) -> None:
         replace(rays, direction=rays.head, hit=None).with_tracking("head").save(heads)
         for seed in range(args.seed, args.seed + args.folds):
             # The last field has no surfaces, as that of heads.
-            for surfaces in dict.fromkeys([where["geometry"], "none"]):
-                gaze = train(folder, path, {"geometry": surfaces}, seed, args.threads)
-                scores = score_head(gaze, rays, args.threads)
+            for surfaces in dict.fromkeys([where, "none"]):
+                gaze = train(folder, path, surfaces, seed, args.threads)
+                scores = score_head(gaze, rays)
                 scores_of_head += [{"scene": name, "surfaces": surfaces, **row} for row in scores]
-            of_heads = train(folder, heads, {"geometry": "none"}, seed, args.threads)
+            of_heads = train(folder, heads, "none", seed, args.threads)
             fields += [{"scene": name, **row} for row in compare_fields(gaze, of_heads, rays, ns)]
-    write_rows(args.out / "head.csv", scores_of_head)
-    write_rows(args.out / "fields.csv", fields)
     show_head(scores_of_head)
     show_fields(fields)
 
 
-def score_head(gaze: Path, rays, threads: int | None) -> list[dict]:
+def score_head(gaze: Path, rays) -> list[dict]:
     """Scores of `nerg eval next --head`, each with the mean direction of gaze in the head in degrees."""
-    from nerg_mi.workflows.gaze_commands import NextLookOptions
-    from nerg_mi.workflows.next_look import evaluate_next_look
+    from nerg_mi.evaluation.next_look_scores import next_look
 
-    result = evaluate_next_look(gaze, rays, None, NextLookOptions(head=True, threads=threads))
+    result = next_look(gaze, rays, head=True)
     ahead, right, up = np.asarray(result.model.gaze_in_head)
     angles = {"right": np.degrees(np.arctan2(right, ahead)), "up": np.degrees(np.arcsin(up))}
     return [{**angles, **row} for row in result.rows]
@@ -187,11 +189,11 @@ def compare_fields(gaze: Path, heads: Path, rays, ns) -> list[dict]:
     """Scores of the fields of gaze and of heads, and of the prior, on the gaze of held-out participants at held-out
     positions."""
     from nerg_mi.evaluation.baselines import make_prior_baseline
-    from nerg_mi.evaluation.gaze import FieldDensity, evaluate_gaze, make_test, select_held_out_rays
+    from nerg_mi.evaluation.gaze import FieldDensity, make_test, score_methods, select_held_out_rays
     from nerg_mi.evaluation.next_look import PastLooks, measure_gaze_in_head
     from nerg_mi.formats.fields import load_gaze
     from nerg_mi.maths.vmf import kappa_from_mean_resultant_length
-    from nerg_mi.train.gaze_data import select_prior_kappa
+    from nerg_mi.train.prior import select_prior_kappa
 
     (field, metadata), (of_heads, metadata_of_heads) = (load_gaze(path, ns) for path in (gaze, heads))
     holdout = metadata["provenance"]["test"]
@@ -205,7 +207,7 @@ def compare_fields(gaze: Path, heads: Path, rays, ns) -> list[dict]:
     prior = make_prior_baseline(train, kappa=select_prior_kappa(train))
     density = FieldDensity(of_heads, None)
     methods = {OURS: FieldDensity(field, None), HEADS: density, WIDENED: widen(density, in_head, kappa), PRIOR: prior}
-    return [{"kappa": kappa, **row} for row in evaluate_gaze(test, methods, prior)]
+    return [{"kappa": kappa, **row} for row in score_methods(test, methods, prior)]
 
 
 def widen(heads, gaze_in_head: np.ndarray, kappa: float):
@@ -250,20 +252,22 @@ def show_head(each: list[dict]) -> None:
         ]
         table.append([scene, surfaces, *angles, *bits, average(by_method[HEAD], "gap")])
     head = ["scene", "surfaces", "right", "up", "field", HEAD, "head and prior", BOTH, "more"]
-    print_table("Bits given the direction of the head", head, table)
+    save_result("heads-bits", head, table)
 
 
 def show_fields(each: list[dict]) -> None:
+    table = []
     for score in SCORES:
-        table = []
         for scene in dict.fromkeys(row["scene"] for row in each):
             rows = [row for row in each if row["scene"] == scene]
             by_method = {m: [row for row in rows if row["method"] == m] for m in (PRIOR, OURS, HEADS, WIDENED)}
             means = [f"{np.mean([row[score] for row in by_method[m]]):.3f}" for m in by_method]
             kappa = f"{np.mean([row['kappa'] for row in rows]):.0f}"
-            table.append([scene, kappa, *means, *(average(by_method[m], f"{score}.gap") for m in (HEADS, WIDENED))])
-        head = ["scene", "kappa", "prior", "gaze", HEADS, WIDENED, "gaze minus heads", "gaze minus widened"]
-        print_table(f"{score} of fields of gaze and of heads", head, table)
+            table.append(
+                [score, scene, kappa, *means, *(average(by_method[m], f"{score}.gap") for m in (HEADS, WIDENED))]
+            )
+    head = ["score", "scene", "kappa", "prior", "gaze", HEADS, WIDENED, "gaze minus heads", "gaze minus widened"]
+    save_result("heads-fields", head, table)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Largest numerical errors of a march: slabs, single steps, sheets, profiles and difficult densities.
 
-    python benchmarks/numerics.py [--update docs/explanation/numerics.md]
+    python benchmarks/numerics.py
 
 Values and derivatives of each case are compared with a closed form or with a computation in float64. A row of the
 tables has the case, its range, the quantity, the largest error, and the reference. Errors are relative unless the row
@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import math
 from dataclasses import dataclass
-from pathlib import Path
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 from nerg_mi.fields.radiance import density_from_log
@@ -28,7 +27,7 @@ from nerg_mi.transport.quadrature import (
     mean_depth_fraction,
 )
 from nerg_mi.transport.volume_medium import VolumeMedium
-from timing import print_table
+from timing import save_result
 
 import drjit as dr
 import numpy as np
@@ -322,9 +321,10 @@ PROFILES = (sheets_in_a_grid, sheets_and_steps, jump, exponential, odd_densities
 
 
 def tables(mi):
-    yield slabs(mi)
-    for title, cases in GROUPS.items():
-        yield title, HEAD, [row.cells() for case in cases for row in case(mi)]
+    """The name, columns and rows of each result."""
+    yield "numerics-slabs", *slabs(mi)
+    for name, cases in GROUPS.items():
+        yield name, HEAD, [row.cells() for case in cases for row in case(mi)]
 
 
 # ----------------------------------------------------------------------------
@@ -399,7 +399,7 @@ def slabs(mi):
                         errors[name] = max(errors.get(name, 0), e)
         note = "" if math.exp(-sigma) > 1e-6 else " (absolute)"
         rows.append([f"{sigma:g}", *(f"{errors[n]:.1e}{note if n.startswith('∂ opacity') else ''}" for n in head)])
-    return "Slab of length 1: largest error of `constvolume` and `gridvolume`, closed form", ["σ", *head], rows
+    return ["σ", *head], rows
 
 
 # ----------------------------------------------------------------------------
@@ -491,25 +491,20 @@ def all_opacities(mi):
 
 
 GROUPS = {
-    "Steps and samples": (one_step, any_number_of_samples, million_rays, all_opacities),
-    "Profiles and densities": PROFILES,
+    "numerics-steps": (one_step, any_number_of_samples, million_rays, all_opacities),
+    "numerics-profiles": PROFILES,
 }
 
 
 def main(argv=None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-m", "--mode", default="llvm_ad_rgb", help="Mitsuba variant. Default: %(default)s.")
-    parser.add_argument(
-        "--update",
-        type=Path,
-        help="Page of the manual whose tables below the same headings are replaced. Default: none.",
-    )
     args = parser.parse_args(argv)
     import mitsuba as mi
 
     mi.set_variant(args.mode)
-    for title, head, rows in tables(mi):
-        print_table(title, head, rows, args.update)
+    for table in tables(mi):
+        save_result(*table)
 
 
 if __name__ == "__main__":

@@ -20,9 +20,10 @@ from pathlib import Path
 from unittest import mock
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
-from nerg_mi.measures.estimates import adjust_p_values
-from nerg_mi.measures.tables import COMPARED_MEASURES, MEASURES, MEASURES_BY_NAME
+from nerg_mi.aoi.estimates import adjust_p_values
+from nerg_mi.aoi.tables import COMPARED_MEASURES, MEASURES, MEASURES_BY_NAME
 from object_statistics import Walks, counting_of, made_store
+from timing import save_result
 
 import numpy as np
 from scipy import stats
@@ -59,20 +60,21 @@ class Population:
 
 
 def _visits() -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    from nerg_mi.aoi.areas import Areas
     from nerg_mi.aoi.measured import count_block
-    from nerg_mi.aoi.scene import make_aois
-    from nerg_mi.formats.areas import AreaSet, Region
-    from nerg_mi.measures.tables import Participants
-    from nerg_mi.measures.visits import ALL
+    from nerg_mi.aoi.placed import place_areas
+    from nerg_mi.aoi.tables import Participants
+    from nerg_mi.aoi.visits import ALL
+    from nerg_mi.formats.boxes import Region
 
-    around, goods, _ = made_store()
-    labels = []
+    store = made_store()
+    goods, labels = store.areas, []
     for box in goods.boxes[::2]:
         middle, size = box.center, np.subtract(box.upper, box.lower)
         half = np.where(size == size.min(), size / 2, np.minimum(size / 2, 0.06))
         labels.append(Region.create(f"label of {box.name}", middle - half, middle + half))
-    areas = AreaSet((*goods.areas, *labels))
-    counting = counting_of(around, areas, make_aois(areas.elements, {}, {}))
+    areas = Areas((*goods.areas, *labels))
+    counting = counting_of(place_areas(store.environment, store.sampler, areas, {}))
     walks, rng = Walks(WALKS), np.random.default_rng(3)
     result: dict[str, list] = defaultdict(list)
     for _ in range(VISITS):
@@ -86,8 +88,7 @@ def _visits() -> dict[str, tuple[np.ndarray, np.ndarray]]:
 def shares(people: tuple[int, ...]) -> None:
     """Coverage for all probabilities, from the binomial distribution."""
     p = np.linspace(0.001, 0.999, 1997)
-    print("| interval of a proportion | participants | mean coverage | minimum | coverage below 90 % | mean width |")
-    print("| --- | ---: | ---: | ---: | ---: | ---: |")
+    rows = []
     for name, interval in _share_intervals().items():
         for n in people:
             k = np.arange(n + 1)
@@ -95,14 +96,14 @@ def shares(people: tuple[int, ...]) -> None:
             weight = stats.binom.pmf(k[:, None], n, p)
             held = (weight * ((low[:, None] <= p) & (p <= high[:, None]))).sum(axis=0)
             width = (weight * (high - low)[:, None]).sum(axis=0).mean()
-            print(
-                f"| {name} | {n} | {100 * held.mean():.1f} % | {100 * held.min():.1f} % | "
-                f"{100 * (held < 0.9).mean():.1f} % | {width:.3f} |"
-            )
+            percent = [f"{100 * v:.1f} %" for v in (held.mean(), held.min(), (held < 0.9).mean())]
+            rows.append([name, n, *percent, f"{width:.3f}"])
+    head = ["interval of a proportion", "participants", "mean coverage", "minimum", "coverage below 90 %", "mean width"]
+    save_result("statistics-proportions", head, rows)
 
 
 def _share_intervals() -> dict:
-    from nerg_mi.measures.estimates import mid_p_interval
+    from nerg_mi.aoi.estimates import mid_p_interval
 
     z = stats.norm.ppf(0.975)
     cut = lambda low, high: (np.maximum(low, 0), np.minimum(high, 1))
@@ -172,7 +173,7 @@ def ratio_intervals(x: np.ndarray, y: np.ndarray, seed: int) -> dict:
 
 def _estimate_with(bandwidth: float | None, x: np.ndarray, y: np.ndarray, seed: int = 0):
     """Estimates whose upper limit is from draws smoothed by ``bandwidth``; None: the default's."""
-    from nerg_mi.measures import estimates
+    from nerg_mi.aoi import estimates
 
     with mock.patch.object(estimates, "BANDWIDTH", estimates.BANDWIDTH if bandwidth is None else bandwidth):
         return estimates.estimate_ratios(x, y, resamples=RESAMPLES, seed=seed)
@@ -204,32 +205,28 @@ class Held:
         inside = expected & (low <= self.truth + 1e-12) & (self.truth <= high + 1e-12)
         self.rows.append(np.stack([inside, expected, np.where(expected, (high - low) / self.truth, np.nan)]))
 
-    def cells(self, common: bool) -> str:
+    def cells(self, common: bool) -> list[str]:
         """Mean, minimum, median width and number of missing intervals, for common and rare AOIs."""
         inside, expected, width = (v[:, self.common == common] for v in np.moveaxis(np.array(self.rows, float), 1, 0))
         some = expected.sum(axis=0) >= DRAWN
         if not some.any():
-            return "| | | | 100 % "
+            return ["", "", "", "100 %"]
         each = inside.sum(axis=0)[some] / expected.sum(axis=0)[some]
         middle = np.nanmedian(np.nanmedian(width[:, some], axis=0))
-        return (
-            f"| {100 * each.mean():.1f} % | {100 * each.min():.1f} % | {100 * middle:.0f} % | "
-            f"{100 * (1 - expected.mean()):.0f} % "
-        )
+        missing = f"{100 * (1 - expected.mean()):.0f} %"
+        return [f"{100 * each.mean():.1f} %", f"{100 * each.min():.1f} %", f"{100 * middle:.0f} %", missing]
 
 
-HEAD = (
-    "| participants | coverage | minimum over AOIs | median width | without interval "
-    "| coverage, rare AOIs | minimum over AOIs | median width | without interval |\n"
-    "| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |"
-)
+_OF_INTERVALS = ["coverage", "minimum over AOIs", "median width", "without interval"]
+HEAD = ["participants", *_OF_INTERVALS, *(f"rare AOIs: {title}" for title in _OF_INTERVALS)]
 
 
 def compare(
     population: Population, sets: int, people: tuple[int, ...], names: tuple[str, ...], variants=ratio_intervals
-):
+) -> list[list]:
+    """The statistic, the interval and the cells of `HEAD` for each row."""
+    rows = []
     for name in names:
-        print(f"\n{MEASURES_BY_NAME[name].title}\n\n| interval {HEAD}")
         for n in people:
             rng, result = np.random.default_rng(n), {}
             for _ in range(sets):
@@ -240,13 +237,13 @@ def compare(
                 for direction, (low, high) in made.items():
                     held = Held(population.truth[name], population.common, MEASURES_BY_NAME[name].upper_limit)
                     result.setdefault(direction, held).add(low, high, expected)
-            for direction, held in result.items():
-                print(f"| {direction} | {n} {held.cells(True)}{held.cells(False)}|", flush=True)
+            rows += [[name, kind, n, *held.cells(True), *held.cells(False)] for kind, held in result.items()]
+    return rows
 
 
 def few_intervals(x: np.ndarray, y: np.ndarray, seed: int) -> dict:
     """Ends of the intervals (K,) with other factors of the error where few participants determine a number."""
-    from nerg_mi.measures import estimates
+    from nerg_mi.aoi import estimates
 
     selected = _estimate_with(0.0, x, y, seed)
     value, _, people = estimates._linearize(x, y)
@@ -271,9 +268,9 @@ def few_intervals(x: np.ndarray, y: np.ndarray, seed: int) -> dict:
 
 
 def numbers(population: Population, sets: int, people: tuple[int, ...]) -> None:
-    from nerg_mi.measures.estimates import estimate_proportions, estimate_ratios
+    from nerg_mi.aoi.estimates import estimate_proportions, estimate_ratios
 
-    print(f"\n| statistic {HEAD}")
+    rows = []
     for n in people:
         rng = np.random.default_rng(n)
         result = {m.name: Held(population.truth[m.name], population.common, m.upper_limit) for m in MEASURES}
@@ -287,19 +284,15 @@ def numbers(population: Population, sets: int, people: tuple[int, ...]) -> None:
                     else estimate_ratios(x, y, resamples=RESAMPLES, seed=seed, upper_limit=m.upper_limit)
                 )
                 result[m.name].add(e.low, e.high, np.isfinite(e.low))
-        for name, held in result.items():
-            print(f"| {name} | {n} {held.cells(True)}{held.cells(False)}|", flush=True)
+        rows += [[name, n, *held.cells(True), *held.cells(False)] for name, held in result.items()]
+    save_result("statistics-coverage", ["statistic", *HEAD], rows, "the number of participants")
 
 
 def differences(population: Population, sets: int, pairs: tuple[tuple[int, int], ...]) -> None:
     """Rate at which two groups of one population are found to differ, p <= 0.05, before and after the adjustment."""
-    from nerg_mi.measures.estimates import estimate_proportion_differences, estimate_ratio_differences
+    from nerg_mi.aoi.estimates import estimate_proportion_differences, estimate_ratio_differences
 
-    print(
-        "\n| participants | statistic | p <= 0.05 | maximum over AOIs | p <= 0.05, rare AOIs | maximum over AOIs "
-        "| sets with a false discovery |"
-    )
-    print("| --- | --- | ---: | ---: | ---: | ---: | ---: |")
+    rows = []
     for m, n in pairs:
         rng, result, wrong = np.random.default_rng([m, n]), defaultdict(list), []
         first = (np.arange(m + n) < m).astype(float)[:, None]
@@ -319,7 +312,10 @@ def differences(population: Population, sets: int, pairs: tuple[tuple[int, int],
         for name, p in result.items():
             rate = (np.array(p) <= 0.05).mean(axis=0)
             cells = [f"{100 * f(rate[population.common == c]):.1f} %" for c in (True, False) for f in (np.mean, np.max)]
-            print(f"| {m} and {n} | {name} | {' | '.join(cells)} | {100 * np.mean(wrong):.1f} % |", flush=True)
+            rows.append([f"{m} and {n}", name, *cells, f"{100 * np.mean(wrong):.1f} %"])
+    head = ["participants", "statistic", "p <= 0.05", "maximum over AOIs", "rare AOIs: p <= 0.05"]
+    head += ["rare AOIs: maximum", "sets with a false discovery"]
+    save_result("statistics-false-positives", head, rows, "the numbers of participants")
 
 
 def _draw_lognormal(spread: float):
@@ -352,8 +348,7 @@ def tails(sets: int, people: tuple[int, ...]) -> None:
         covered = (e.low <= truth) & (truth <= e.high)
         return covered[has_interval].mean(), (e.high - e.low)[has_interval].mean()
 
-    print("\n| distribution | participants | statistic | coverage without smoothing | coverage | width ratio |")
-    print("| --- | ---: | --- | ---: | ---: | ---: |")
+    rows = []
     for name, draw in TAILS.items():
         for n in people:
             rng, result = np.random.default_rng([n, *name.encode()]), {}
@@ -364,10 +359,10 @@ def tails(sets: int, people: tuple[int, ...]) -> None:
             result["ratio, times of spread 1.5"] = x * time, time, 1.0
             for what, case in result.items():
                 (before, width), (now, new_width) = measure(*case, 0.0), measure(*case, None)
-                print(
-                    f"| {name} | {n} | {what} | {100 * before:.1f} % | {100 * now:.1f} % | {new_width / width:.2f} |",
-                    flush=True,
-                )
+                percent = [f"{100 * v:.1f} %" for v in (before, now)]
+                rows.append([name, n, what, *percent, f"{new_width / width:.2f}"])
+    head = ["distribution", "participants", "statistic", "coverage without smoothing", "coverage", "width ratio"]
+    save_result("statistics-tails", head, rows, "the number of participants and the name")
 
 
 def main() -> None:
@@ -414,10 +409,11 @@ def main() -> None:
         f"to {truth.max():.4f}, of {(~population.common).sum()} rare ones {truth.min():.2f} to "
         f"{truth[~population.common].max():.2f}"
     )
-    if arguments.what == "ratios":
-        compare(population, arguments.sets, people, tuple(arguments.of))
-    elif arguments.what == "few":
-        compare(population, arguments.sets, people, tuple(arguments.of), few_intervals)
+    if arguments.what in ("ratios", "few"):
+        variants = ratio_intervals if arguments.what == "ratios" else few_intervals
+        rows = compare(population, arguments.sets, people, tuple(arguments.of), variants)
+        name = "statistics-intervals" if arguments.what == "ratios" else "statistics-few"
+        save_result(name, ["statistic", "interval", *HEAD], rows, "the number of participants")
     elif arguments.what == "numbers":
         numbers(population, arguments.sets, people)
     else:

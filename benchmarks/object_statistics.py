@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
+from timing import save_result
 
 import numpy as np
 
@@ -24,27 +25,19 @@ def made_store():
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
-    from nerg_mi.aoi.scene import load_scene_file, make_aois, shapes_by_id
-    from nerg_mi.formats.areas import read_areas
-    from nerg_mi.workflows.demo import find_store_scene
+    from nerg_mi.aoi.areas import Areas
+    from nerg_mi.aoi.placed import open_placed_areas
+    from nerg_mi.scenes.store import SCENE_FILE
 
-    folder = find_store_scene().parent
-    around = load_scene_file(folder / "shapes.xml", None, None, None)
-    areas = read_areas(folder / "regions.json")
-    return around, areas, make_aois(areas.elements, shapes_by_id(around.scene), {})
+    folder = SCENE_FILE.parent
+    return open_placed_areas(folder / "shapes.xml", None, Areas.load(folder / "regions.json"))
 
 
-def counting_of(around, areas, shapes, seen: bool = True):
-    from nerg_mi.aoi.measured import AoiContext
-    from nerg_mi.measures.shares import SamplePoints, VisibilityCache
-    from nerg_mi.measures.visits import VisitRules
+def counting_of(placed):
+    from nerg_mi.aoi.measured import AoiContext, Counting
+    from nerg_mi.aoi.settings import VisitRules
 
-    in_view = VisibilityCache(SamplePoints.sample(shapes, 48), around.trace_depth, 0.1, 0.03) if seen else None
-    members = list(areas.element_indices().values())
-    rules = VisitRules(max_gap=2.0, session_pause=60.0, merge_gap=0.15, min_visit=0.1)
-    return AoiContext(
-        around, shapes, areas.names, members, range(len(members)), rules, 0.03, fov=120.0, visibility_cache=in_view
-    )
+    return AoiContext(placed, Counting(VisitRules(max_gap=2.0), aoi_visibility=True))
 
 
 class Walks:
@@ -83,7 +76,7 @@ class Walks:
 
     def rays(self, who: np.ndarray, rng: np.random.Generator):
         """Rays of these walks, each of one participant."""
-        from nerg_mi.rays.rays import Rays
+        from nerg_mi.tracking.rays import Rays
 
         rows = np.concatenate([np.arange(self.start[w], self.start[w + 1]) for w in who])
         person = np.repeat(np.arange(len(who)), self.lengths[who])
@@ -93,18 +86,19 @@ class Walks:
 
 
 def errors() -> None:
-    from nerg_mi.aoi.measured import Viewpoints, count_block
-    from nerg_mi.aoi.predicted import predict_attention
+    from nerg_mi.aoi.measured import count_block
+    from nerg_mi.aoi.placed import assign_hits
+    from nerg_mi.aoi.predicted import Viewpoints, predict_attention
+    from nerg_mi.aoi.shares import SamplePoints
+    from nerg_mi.aoi.tables import Participants
+    from nerg_mi.aoi.visits import ALL
     from nerg_mi.maths.sphere import fibonacci_directions
-    from nerg_mi.measures.shares import SamplePoints
-    from nerg_mi.measures.tables import Participants
-    from nerg_mi.measures.visits import ALL, assign_hits
-    from nerg_mi.progress import SILENT
     from nerg_mi.scenes.store import twin
 
-    around, areas, shapes = made_store()
+    placed = made_store()
+    areas, shapes = placed.areas, placed.aois
     walks = Walks(12, seed=5)
-    counting = counting_of(around, areas, shapes)
+    counting = counting_of(placed)
     rng = np.random.default_rng(1)
     rays = walks.rays(np.arange(12), rng)
     people = Participants.from_sums(count_block(rays, counting), ALL, True)
@@ -124,10 +118,10 @@ def errors() -> None:
             if near < far and far > 0 and near - 0.03 <= depth[i] < far + 0.03:
                 dwell[rays.person[i], k] += weight
                 reached[rays.person[i], k] = 1
-    print("| statistic | reference | maximum error |\n| --- | --- | ---: |")
     largest = np.abs(people.dwell_time - dwell).max()
-    print(f"| dwell time [s] per participant and AOI | plain loops, ray casts to the twin | {largest:.2g} |")
-    print(f"| hit ratio per participant and AOI | the same | {np.abs(people.hit_probability - reached).max():.2g} |")
+    table = [["dwell time [s] per participant and AOI", "plain loops, ray casts to the twin", f"{largest:.2g}"]]
+    largest = np.abs(people.hit_probability - reached).max()
+    table.append(["hit ratio per participant and AOI", "the same", f"{largest:.2g}"])
     # Fractions of the law, by quadrature over the sphere at some positions, next to the field's and a large sample.
     rows = np.linspace(0, len(walks.origin) - 1, 160).round().astype(int)
     d = fibonacci_directions(8192)
@@ -147,7 +141,7 @@ def errors() -> None:
     draws = 400
     many = np.tile(rows, draws)
     directions = walks.draw(many, rng)
-    from nerg_mi.rays.rays import Rays
+    from nerg_mi.tracking.rays import Rays
 
     sampled = Rays(
         np.repeat(np.arange(draws), len(rows)) * 1.0,
@@ -163,29 +157,26 @@ def errors() -> None:
     sigma = np.sqrt(shares * (1 - shares) / len(many))
     off = np.abs(counted - shares)
     worst = off / sigma
-    print(
-        f"| share of {draws * len(rows):,} rays | quadrature of the ground truth | {off.max():.2g} "
-        f"of {shares.max():.2g}, {worst.max():.1f} standard errors (median {np.median(worst):.1f}) |"
-    )
+    errors = f"{worst.max():.1f} standard errors (median {np.median(worst):.1f})"
+    error = f"{off.max():.2g} of {shares.max():.2g}, {errors}"
+    table.append([f"share of {draws * len(rows):,} rays", "quadrature of the ground truth", error])
     mean = far.sum(axis=0) / law.sum(axis=0)
     near = np.array([v.mean() for v in landed.distance])
     off = np.abs(near - mean)
-    print(f"| mean distance [m] of these | the same | {off.max():.2g} (median {np.median(off):.2g}) |")
+    table.append(["mean distance [m] of these", "the same", f"{off.max():.2g} (median {np.median(off):.2g})"])
     at = Viewpoints(
         positions,
         np.tile([1.0, 0, 0], (len(positions), 1)),
         tuple(map(str, range(len(positions)))),
         (frozenset([ALL]),) * len(positions),
     )
-    reported = predict_attention(around, at, shapes, counting.members, 0.03, 360.0, 48, 8192, SILENT)
+    reported = predict_attention(placed, at, 360.0)
     error = np.abs(reported.share.mean(axis=0) - shares)
     r = np.corrcoef(reported.share.mean(axis=0), shares)[0, 1]
-    print(
-        f"| share by the field | the same | {error.max():.2g} (median {np.median(error):.2g} of "
-        f"{np.median(shares):.2g}; r {r:.3f}) |"
-    )
+    middle = f"median {np.median(error):.2g} of {np.median(shares):.2g}; r {r:.3f}"
+    table.append(["share by the field", "the same", f"{error.max():.2g} ({middle})"])
     off = np.abs(reported.distance.sum(axis=0) / reported.share.sum(axis=0) - mean)
-    print(f"| mean distance [m] by the field | the same | {off.max():.2g} (median {np.median(off):.2g}) |")
+    table.append(["mean distance [m] by the field", "the same", f"{off.max():.2g} (median {np.median(off):.2g})"])
     # Visibility: exact ray casts from the participants' positions, against cells of 10 cm.
     some = np.linspace(0, len(rays) - 1, 1500).round().astype(int)
     selected = rays.select(some)
@@ -203,11 +194,11 @@ def errors() -> None:
             free[ask] = twin.is_visible(selected.origin[n], targets.points[ask], tolerance=0.03)
         exact[n] = np.bincount(targets.aoi_index, weights=free, minlength=exact.shape[1]) > 0
     agree = (seen == exact).mean()
-    print(
-        f"| visible or not, {seen.size:,} pairs | ray casts from the recorded positions | {100 * (1 - agree):.2f} % "
-        "differ |"
-    )
-    print(f"| visible share per AOI | the same | {np.abs(seen.mean(axis=0) - exact.mean(axis=0)).max():.2g} |")
+    error = f"{100 * (1 - agree):.2f} % differ"
+    table.append([f"visible or not, {seen.size:,} pairs", "ray casts from the recorded positions", error])
+    largest = np.abs(seen.mean(axis=0) - exact.mean(axis=0)).max()
+    table.append(["visible share per AOI", "the same", f"{largest:.2g}"])
+    save_result("statistics-errors", ("statistic", "reference", "maximum error"), table, "1, 5")
 
 
 def main() -> None:

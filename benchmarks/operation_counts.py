@@ -2,7 +2,7 @@
 
     python benchmarks/operation_counts.py [--width 240] [--runs 5]
 
-Prints a table for docs/explanation/performance.md and writes it as out/benchmarks/operation_counts.csv. The counts do
+Saves the result `operations`. The counts do
 not depend on the machine. CPU times are medians over several runs, and only their ratios are meaningful.
 """
 
@@ -16,8 +16,7 @@ from pathlib import Path
 
 import nerg_mi.scenes.store
 from nerg_mi.evaluation.study import count_traced_operations
-from nerg_mi.files.tables import format_markdown_table
-from timing import write_rows
+from timing import save_result
 
 import mitsuba as mi
 
@@ -117,21 +116,8 @@ def main() -> None:
         [name, f"{operations:,}", f"{density:.1f}", f"{color:.1f}", f"{gaze:.2f}", f"{seconds:.3f}"]
         for name, operations, density, color, gaze, seconds in rows
     ]
-    print(
-        format_markdown_table(
-            [
-                "configuration",
-                "traced operations",
-                "density evaluations",
-                "colour evaluations",
-                "gaze evaluations",
-                "CPU time, s",
-            ],
-            shown,
-        )
-    )
-    names = ("what", "operations", "density_evals", "color_evals", "gaze_evals", "seconds")
-    write_rows(Path("out/benchmarks/operation_counts.csv"), [dict(zip(names, row)) for row in rows])
+    head = ("configuration", "traced operations", "density evaluations", "colour evaluations", "gaze evaluations")
+    save_result("operations", (*head, "CPU time, s"), shown)
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from __future__ import annotations
 import ablation
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 from places import interval, parse, parse_environments, place_parser, write_place
-from timing import print_table, write_rows
+from timing import save_result
 
 import numpy as np
 
@@ -49,7 +49,7 @@ def main(argv=None) -> None:
     for name, make in parse_environments(args).items():
         folder, rays, where = write_place(name, make, args)
         for fold in range(args.folds):
-            line = [str(rays), "--geometry", str(next(iter(where.values()))), "--out", str(folder / f"fold{fold}")]
+            line = [str(rays), "--environment", str(where), "--out", str(folder / f"fold{fold}")]
             line += ["--seed", str(fold), "--test-participants", "0.5", "--no-refit"]
             line += [] if args.threads is None else ["--threads", str(args.threads)]
             line += [word for variant in args.variant for word in ("--variant", variant)]
@@ -57,24 +57,24 @@ def main(argv=None) -> None:
                 steps = [] if recipe == "default" else ["--steps", str(args.steps)]
                 rows = ablation.main([*line, "--recipes", recipe, *steps])
                 each += [{"place": name, "fold": fold, **row} for row in rows]
-        separate = [row for row in each if row["place"] == name]
-        heads = ("recipe", "variant", "training loss", "test minus training loss")
-        heads += ("KLD", "minus product", "CC", "minus product")
-        print_table(f"The paper's variants: {name}", heads, summarise(separate))
-        write_rows(args.out / "folds.csv", each)
+    seeds = ", ".join(map(str, range(args.folds)))
+    heads = ("scene", "recipe", "variant", "training loss", "held-out minus training loss")
+    heads += ("KLD", "KLD minus product", "CC", "CC minus product")
+    save_result("paper-variants", heads, summarise(each), seeds)
     heads = ("scene", "recipe", "product", *(f"{v} minus product" for v in ORDER), "training time, s")
-    print_table("CC in all scenes", heads, order(each))
+    save_result("paper-claims", heads, order(each), seeds)
 
 
 def summarise(rows: list[dict]) -> list[list[str]]:
-    """Means over folds of one scene, and their difference from the product."""
+    """Means over folds, and their difference from the product."""
     out = []
-    for recipe, variant in dict.fromkeys((r["recipe"], r["variant"]) for r in rows):
-        separate = [r for r in rows if (r["recipe"], r["variant"]) == (recipe, variant)]
-        cells = [recipe, variant, f"{np.mean([r['train_loss'] for r in separate]):.3f}"]
+    for place, recipe, variant in dict.fromkeys((r["place"], r["recipe"], r["variant"]) for r in rows):
+        in_place = [r for r in rows if r["place"] == place]
+        separate = [r for r in in_place if (r["recipe"], r["variant"]) == (recipe, variant)]
+        cells = [place, recipe, variant, f"{np.mean([r['train_loss'] for r in separate]):.3f}"]
         cells.append(print_row([r["test_loss"] - r["train_loss"] for r in separate]))
         for key in ("test_KLD", "test_CC"):
-            above = "" if variant == WHOLE else print_row(less(rows, recipe, variant, key))
+            above = "" if variant == WHOLE else print_row(less(in_place, recipe, variant, key))
             cells += [f"{np.mean([r[key] for r in separate]):.3f}", above]
         out.append(cells)
     return out

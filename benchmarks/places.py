@@ -11,11 +11,9 @@ at 60 positions in three zones. Training data within 2R of these positions are e
 `nerg eval gaze`, tuned on the training rays. The agreement between two halves of the held-out participants (split half)
 is a reference.
 
-Columns of places.csv: ``rank`` is the rank of the field among all methods but the split half. ``less`` is the field
-minus the best baseline, fold by fold, and ``reach`` the half width of its 95 % interval over participants: folds share
-participants, so that it is that of one fold (root mean square over folds). ``way`` is the
-position of the field's CC between the position-independent density (0) and the split half (1), where the latter is
-better.
+The best baseline is chosen by the same scores, which favours the baselines. "Field minus best baseline" has the 95 %
+interval over participants: folds share participants, so that it is that of one fold (root mean square over folds).
+folds.csv has the scores of each fold, for `--against`.
 
 ``--uncertainty`` evaluates in the same folds whether a field estimates its own error. Use more zones for it, since the
 positions of a zone are neighbours. The table has one row per scene: Spearman's rank correlation of low support with the
@@ -30,10 +28,12 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from math import isnan, nan
 from pathlib import Path
 
-from timing import print_table, write_rows
+from nerg_mi.files.tables import write_csv
+from timing import save_result
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -60,6 +60,7 @@ def place_parser(what: str, out: str, folds: int, only: str | None = None) -> ar
     )
     parser.add_argument("--folds", type=int, default=folds, help="Number of folds. Default: %(default)s.")
     parser.add_argument("--threads", type=int, help="Number of CPU threads. Default: all cores.")
+    parser.add_argument("--result", default=out, help="Name of the result. Default: %(default)s.")
     parser.add_argument(
         "--out", type=Path, default=Path("out/benchmarks") / out, help="Folder for the results. Default: %(default)s."
     )
@@ -86,7 +87,7 @@ def parse_environments(args: argparse.Namespace) -> dict[str, Make]:
     return {name: expected[name] for name in names}
 
 
-def write_place(name: str, make: Make, args: argparse.Namespace) -> tuple[Path, Path, dict]:
+def write_place(name: str, make: Make, args: argparse.Namespace) -> tuple[Path, Path, str | Path]:
     """``(folder, rays, where)`` of a scene, below the output folder."""
     folder = args.out / name
     folder.mkdir(exist_ok=True)
@@ -94,15 +95,15 @@ def write_place(name: str, make: Make, args: argparse.Namespace) -> tuple[Path, 
 
 
 def makers(data: Path) -> dict[str, Make]:
-    """By name, functions that write the rays of a scene into a folder and return its location: options of a fold."""
+    """By name, functions that write the rays of a scene into a folder and return their file and the environment."""
     from generated_places import PLACES
 
     out: dict[str, Make] = {}
     if shop := sorted((data / "vr_supermarket").glob("*.csv.gz")):
-        out["supermarket"] = lambda folder: (recorded(shop, "vr_supermarket", folder), {"geometry": "hits"})
+        out["supermarket"] = lambda folder: (recorded(shop, "vr_supermarket", folder), "hits")
     for scene in sorted(path for path in (data / "eyenavgs").glob("*") if path.is_dir()):
         if files := sorted(scene.glob("*.csv.gz")):
-            out[scene.name] = lambda folder, files=files: (recorded(files, "eyenavgs", folder), {"geometry": "none"})
+            out[scene.name] = lambda folder, files=files: (recorded(files, "eyenavgs", folder), "none")
     out["store"] = store
     for make in PLACES:
         place = make()
@@ -112,34 +113,30 @@ def makers(data: Path) -> dict[str, Make]:
 
 def recorded(files: list[Path], reader: str, folder: Path) -> Path:
     """Rays of recordings; readers skip recordings with frozen gaze and report them."""
-    from nerg_mi.workflows.rays import import_rays
-    from nerg_mi.workflows.rays_commands import RaysImportOptions
+    from nerg_mi.tracking.imports import import_rays
 
     path = folder / "rays.npz"
-    import_rays(files, RaysImportOptions(reader=reader, output=path))
+    import_rays(files, reader, output=path)
     return path
 
 
 def store(folder: Path) -> tuple[Path, dict]:
     """The demo store's shoppers in its radiance field."""
-    from nerg_mi.rays.readers.skeleton import SkeletonOptions
-    from nerg_mi.scenes.store import make
-    from nerg_mi.workflows import demo
-    from nerg_mi.workflows.rays import import_rays
-    from nerg_mi.workflows.rays_commands import RaysImportOptions
+    from nerg_mi.scenes.store import SCENE_FILE, make
+    from nerg_mi.tracking.imports import import_rays
 
     csv = Path(make.__file__).parent / "build" / "shoppers.csv"
     if not csv.is_file():
         make.main(["--stage", "shoppers"])
     path = folder / "rays.npz"
-    import_rays([csv], RaysImportOptions(reader="skeleton", settings=SkeletonOptions(tick=0.001), output=path))
-    return path, {"field": demo.find_store_scene().parent / "store.safetensors"}
+    import_rays(csv, "skeleton", tick=0.001, output=path)
+    return path, SCENE_FILE.parent / "store.safetensors"
 
 
 def generated(place, folder: Path) -> tuple[Path, dict]:
     scene, path = place.write(folder / "scene.xml"), folder / "rays.npz"
     place.record(scene).save(path)
-    return path, {"scene": scene}
+    return path, scene
 
 
 OURS, PRIOR, HALF = "gaze field", "position-independent prior", "split half"
@@ -200,72 +197,46 @@ def main(argv=None) -> None:
             for row in result.each
         ]
         unsure += uncertainty(name, result)
-    write_rows(args.out / "folds.csv", each)
+    write_csv(args.out / "folds.csv", each)
+    seeds = ", ".join(map(str, range(args.seed, args.seed + args.folds)))
     if args.uncertainty:
-        write_rows(args.out / "uncertainty.csv", unsure)
-        show_uncertainty(unsure)
+        save_uncertainty(args.result, unsure, seeds)
         return
-    rows = summarise(each)
-    write_rows(args.out / "places.csv", rows)
-    show(rows)
+    save_places(args.result, each, seeds)
+    save_methods(f"{args.result}-methods", each, seeds)
     if args.against is not None:
         show_change(each, args.against)
 
 
 def evaluate(name: str, make: Make, args: argparse.Namespace):
     """The results of `nerg eval folds` for a scene."""
+    from nerg_mi.cli.declarations import select_backend
+    from nerg_mi.evaluation.folds import folds
     from nerg_mi.progress import TerminalReporter
-    from nerg_mi.workflows.base import select_backend
-    from nerg_mi.workflows.evaluate import evaluate_folds
-    from nerg_mi.workflows.gaze_commands import FoldOptions
+    from nerg_mi.tasks.settings import Parallel
+    from nerg_mi.train.gaze_recipes import get_recipe
 
     select_backend("llvm_ad_rgb", args.threads)
     folder, rays, where = write_place(name, make, args)
-    options = FoldOptions(
-        **({"geometry": "none"} if args.no_surfaces else where),
-        recipe=args.recipe,
-        variant=args.variant,
-        folds=args.folds,
-        seed=args.seed,
-        test_zones=args.zones,
-        splits="both,people" if args.uncertainty else "both",
-        ensemble=args.ensemble,
-        prior_folds=args.prior_folds,
-        prior_kappa=args.prior_kappa,
-        threads=args.threads,
-    )
+    recipe = get_recipe(args.recipe)
+    if args.prior_kappa is not None:
+        recipe = replace(recipe, probes=replace(recipe.probes, prior_kappa=args.prior_kappa))
     with TerminalReporter() as reporter:
-        return evaluate_folds(rays, folder / "eval", options, reporter)
-
-
-def summarise(each: list[dict]) -> list[dict]:
-    """One row per scene: the field's scores, those of the best baseline, and their difference."""
-    import numpy as np
-
-    out = []
-    for name in dict.fromkeys(row["place"] for row in each):
-        separate = [row for row in each if row["place"] == name]
-        methods = [m for m in dict.fromkeys(row["method"] for row in separate) if m != HALF]
-        row: dict = {"place": name, "folds": len({r["fold"] for r in separate})}
-        for s, high in SCORES.items():
-            values = {m: np.array([r[s] for r in separate if r["method"] == m], float) for m in methods}
-            means = {m: v.mean() for m, v in values.items()}
-            order = sorted(methods, key=lambda m: -means[m] if high else means[m])
-            best = next(m for m in order if m != OURS)
-            less = values[OURS] - values[best]
-            widths = np.array([r[f"{s} gap half width"] for r in separate if r["method"] == best], float)
-            scale = float(np.sqrt(np.mean(widths**2)))
-            row |= {s: means[OURS], f"{s} prior": means[PRIOR], f"{s} best": means[best], f"{s} best is": best}
-            row |= {f"{s} rank": order.index(OURS) + 1, f"{s} less": less.mean(), f"{s} reach": scale}
-            row[f"{s} each"] = ", ".join(f"{v:+.3f}" for v in less)
-            half = [r[s] for r in separate if r["method"] == HALF]
-            row[f"{s} half"] = float(np.mean(half)) if half else np.nan
-        # With few participants one half predicts the other worse than the position-independent prior does: the fraction
-        # is undefined.
-        further = row["CC half"] - row["CC prior"]
-        row["way"] = (row["CC"] - row["CC prior"]) / further if further > 0 else np.nan
-        out.append(row)
-    return out
+        return folds(
+            rays,
+            "none" if args.no_surfaces else where,
+            recipe=recipe,
+            variant=args.variant,
+            folds=args.folds,
+            seed=args.seed,
+            test_zones=args.zones,
+            splits="both,people" if args.uncertainty else "both",
+            ensemble=args.ensemble,
+            prior_folds=args.prior_folds,
+            output=folder / "eval",
+            parallel=Parallel(threads=args.threads),
+            progress=reporter,
+        )
 
 
 def half_widths(row: dict) -> dict:
@@ -300,30 +271,38 @@ def show_change(each: list[dict], before: Path) -> None:
         print(f"{name:12s}" + ", ".join(f"{s} {v.mean():+.3f} ± {interval(v):.3f}" for s, v in less.items()))
 
 
-def show(rows: list[dict]) -> None:
-    for s in SCORES:
-        table = [
-            [
-                r["place"],
-                r["folds"],
-                f"{r[f'{s} prior']:.3f}",
-                r[f"{s} best is"],
-                f"{r[f'{s} best']:.3f}",
-                f"{r[s]:.3f}",
-                f"{r[f'{s} less']:+.3f} ± {r[f'{s} reach']:.3f}",
-                r[f"{s} each"],
-            ]
-            for r in rows
-        ]
-        head = (s, "folds", "position-independent prior", "best baseline", "its value", "field")
-        head = (*head, "field minus best baseline", "by fold")
-        print_table(f"{s} in all scenes", head, table)
-    print("means over scenes: " + ", ".join(f"{s} {sum(r[s] for r in rows) / len(rows):.3f}" for s in SCORES))
-    ranks = [r[f"{s} rank"] for r in rows for s in SCORES]
-    worst = max(rows, key=lambda r: r["KLD less"])
-    print(f"mean rank {sum(ranks) / len(ranks):.2f}; worst scene in KLD: {worst['place']}, {worst['KLD less']:+.3f}")
-    if far := [f"{r['place']} {r['way']:.0%}" for r in rows if not isnan(r["way"])]:
-        print(f"CC of the field between the position-independent prior (0 %) and split half (100 %): {', '.join(far)}")
+def save_places(name: str, each: list[dict], seeds: str) -> None:
+    """The field's scores in each scene, those of the best baseline, and their difference."""
+    import numpy as np
+
+    table = []
+    for score, is_higher_better in SCORES.items():
+        for place in dict.fromkeys(row["place"] for row in each):
+            rows = [row for row in each if row["place"] == place and row["method"] != HALF]
+            values = {
+                m: np.array([r[score] for r in rows if r["method"] == m], float)
+                for m in dict.fromkeys(r["method"] for r in rows)
+            }
+            means = {m: v.mean() for m, v in values.items()}
+            best = (max if is_higher_better else min)((m for m in means if m != OURS), key=means.__getitem__)
+            less = values[OURS] - values[best]
+            widths = [r[f"{score} gap half width"] for r in rows if r["method"] == best]
+            half_width = np.sqrt(np.mean(np.square(widths)))
+            cells = [f"{means[PRIOR]:.3f}", best, f"{means[best]:.3f}", f"{means[OURS]:.3f}"]
+            cells += [f"{less.mean():+.3f} ± {half_width:.3f}", ", ".join(f"{v:+.3f}" for v in less)]
+            table.append([score, place, len(less), *cells])
+    head = ("score", "scene", "folds", "prior", "best baseline", "its value", "field", "field minus best baseline")
+    save_result(name, (*head, "by fold"), table, seeds)
+
+
+def save_methods(name: str, each: list[dict], seeds: str) -> None:
+    """Mean scores over folds of each method."""
+    table = []
+    for place, method in dict.fromkeys((r["place"], r["method"]) for r in each):
+        rows = [r for r in each if (r["place"], r["method"]) == (place, method)]
+        means = (sum(float(r[s]) for r in rows) / len(rows) for s in SCORES)
+        table.append([place, method, *("" if isnan(mean) else f"{mean:.3f}" for mean in means)])
+    save_result(name, ("scene", "method", *SCORES), table, seeds)
 
 
 def uncertainty(name: str, result) -> list[dict]:
@@ -336,7 +315,7 @@ def uncertainty(name: str, result) -> list[dict]:
     return [{"place": name, **{key: r[key] for key in keys}, **ends(r), **regions} for r in ranks]
 
 
-def show_uncertainty(rows: list[dict]) -> None:
+def save_uncertainty(name: str, rows: list[dict], seeds: str) -> None:
     by = {(r["place"], r["signal"], r["split"], r["error"]): r for r in rows}
     places = list(dict.fromkeys(r["place"] for r in rows))
     populations = {"new": "both", "any": "anywhere"}
@@ -349,20 +328,17 @@ def show_uncertainty(rows: list[dict]) -> None:
 
     table = []
     for place in places:
-        r = by[place, "support", "anywhere", "KLD"]
-        ranks = [rho(place, split, error) for split in populations.values() for error in ("KLD", "excess")]
+        r = by[place, "support", "both", "KLD"]
+        ranks = [rho(place, "both", error) for error in ("KLD", "excess")]
         regions = [f"{r[key]:.0%}" for key in ("of 80%", "of 80%, calibrated")]
         table.append([place, *ranks, f"{r['100%']:.2f}, {r['50%']:.2f}", *regions])
-    head = ["scene", *(f"{name} positions: {error}" for name in populations for error in ("KLD", "excess KLD"))]
-    head += ["KLD at any positions: all, half with most support", "coverage of 80 % regions", "calibrated"]
-    print_table("Rank correlation of low support and error", head, table)
+    head = ["scene", "rho, KLD", "rho, excess KLD", "KLD: all, half with most support"]
+    save_result(name, [*head, "coverage of 80 % regions", "calibrated"], table, seeds)
     if any(r["signal"] == "spread" for r in rows):
         pairs = [(name, signal) for name in populations for signal in ("support", "spread")]
         rhos = [[f"{by[p, signal, populations[name], 'KLD']['rho']:+.2f}" for name, signal in pairs] for p in places]
         head = ["scene", *(f"{name} positions: {signal}" for name, signal in pairs)]
-        print_table(
-            "Rank correlation with the error: low support and spread", head, [[p, *row] for p, row in zip(places, rhos)]
-        )
+        save_result(f"{name}-spread", head, [[p, *row] for p, row in zip(places, rhos)], seeds)
 
 
 if __name__ == "__main__":

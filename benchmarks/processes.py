@@ -1,8 +1,7 @@
-"""Measurements in separate processes, for `bench.py`: the peak memory of a frame, and start-up times.
+"""Measurements in separate processes: the peak memory of a frame, and start-up times.
 
-    python benchmarks/processes.py memory [--sizes 640x360,1280x720,1920x1080] [--update
-    docs/explanation/performance.md]
-    python benchmarks/processes.py start [--runs 5] [--update docs/explanation/performance.md]
+    python benchmarks/processes.py memory [--sizes 640x360,1280x720,1920x1080]
+    python benchmarks/processes.py start [--runs 5]
 
 ``memory`` measures a frame of the demo store with colour, depth and the gaze of an observer who is not at the camera,
 at one sample per pixel. The image is rendered in one piece by ``mi.render``, and in strips by `nerg render`. Resident
@@ -29,18 +28,15 @@ import time
 from pathlib import Path
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
-from timing import median, print_table, spread
+from timing import median, save_result, spread
 
 SIZES = ((320, 180), (1280, 720), (1920, 1080))
 WAYS = ("mi.render", "nerg render")
 HEADS = {
-    "memory": {
-        "frame": "image size",
-        **{f"`{mode}`, MB resident (MB of arrays)": f"`{mode}`: peak memory (arrays), MB" for mode in WAYS},
-    },
-    "start": {"what": "command", "s": "time, s", "quartiles": "quartiles, s", "CPU s": "CPU time, s"},
+    "memory": ("image size", *(f"`{mode}`: peak memory (arrays), MB" for mode in WAYS)),
+    "start": ("command", "time, s", "quartiles, s", "CPU time, s"),
 }
-"""Name of a column in a CSV file -> its title in the table, by benchmark."""
+"""Titles of columns by benchmark."""
 COMMAND = [str(Path(sys.executable).with_name("nerg"))]
 VARIANT = 'import nerg_mi, mitsuba; mitsuba.set_variant("llvm_ad_rgb")'
 
@@ -60,10 +56,9 @@ def peak(direction: str, width: int, height: int) -> dict[str, float]:
     import numpy as np
 
     mi.set_variant("llvm_ad_rgb")
-    from nerg_mi.rendering.scene import load_scene
-    from nerg_mi.workflows.demo import find_store_scene
-    from nerg_mi.workflows.render import render_file
-    from nerg_mi.workflows.scene_commands import PictureOptions
+    from nerg_mi.environment.scene_loading import load_scene
+    from nerg_mi.figures.films import render_film
+    from nerg_mi.scenes.store import SCENE_FILE
 
     dr.eval(mi.Float([0.0, 1.0]) + 1)
     dr.sync_thread()
@@ -72,11 +67,10 @@ def peak(direction: str, width: int, height: int) -> dict[str, float]:
     before = status("VmRSS")
     values = {"width": str(width), "height": str(height), "spp": "1", "aovs": "depth,gaze"}
     if direction == "mi.render":
-        np.array(mi.render(load_scene(find_store_scene(), values), spp=1))
+        np.array(mi.render(load_scene(SCENE_FILE, values), spp=1))
     else:
         with tempfile.TemporaryDirectory() as folder:
-            options = PictureOptions(spp=1, defaults=values, mode="llvm_ad_rgb")
-            render_file(find_store_scene(), Path(folder) / "a.exr", options)
+            render_film(SCENE_FILE, Path(folder) / "a.exr", spp=1, defaults=values)
     arrays = dr.detail.malloc_watermark(dr.JitBackend.LLVM) / 1e6
     return {"resident": status("VmHWM") - before, "arrays": arrays}
 
@@ -98,9 +92,9 @@ def memory(sizes=SIZES) -> list[list[str]]:
 def works(folder: Path) -> dict[str, tuple[list[str], bool]]:
     """Commands by name, and whether they start without compiled kernels; files are written into ``folder``."""
     # Loads Dr.Jit, whose cache of kernels `torch_frames` must choose before.
-    from nerg_mi.workflows.demo import find_store_scene
+    from nerg_mi.scenes.store import SCENE_FILE
 
-    picture = [*COMMAND, "render", str(find_store_scene()), "-o", str(folder / "a.png"), "-m", "llvm_ad_rgb"]
+    picture = [*COMMAND, "render", str(SCENE_FILE), "-o", str(folder / "a.png"), "-m", "llvm_ad_rgb"]
     demo = [*COMMAND, "demo", "-o", str(folder / "demo"), "-m", "llvm_ad_rgb"]
     return {
         "`import nerg_mi`": ([sys.executable, "-c", "import nerg_mi"], False),
@@ -158,18 +152,13 @@ def main(argv=None) -> None:
         choices=WAYS,
         help="Print the memory of one frame, measured in this process, by the given renderer. Default: none.",
     )
-    parser.add_argument(
-        "--update",
-        type=Path,
-        help="Page of the manual whose tables below the same headings are replaced. Default: none.",
-    )
     args = parser.parse_args(argv)
     sizes = [tuple(map(int, size.split("x"))) for size in args.sizes.split(",")]
     if args.one:
         print(json.dumps(peak(args.one, *sizes[0])))
         return
     rows = memory(sizes) if args.what == "memory" else start(args.runs)
-    print_table(args.what.capitalize(), list(HEADS[args.what].values()), rows, args.update)
+    save_result(args.what, HEADS[args.what], rows)
 
 
 if __name__ == "__main__":

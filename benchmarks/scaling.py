@@ -22,7 +22,7 @@ from functools import partial
 from importlib.resources import files
 from pathlib import Path
 
-from timing import print_table, write_rows
+from timing import save_result
 
 import numpy as np
 
@@ -34,7 +34,7 @@ DETAILS = (0.4, 0.15)
 def room(folder: Path, observers: int, count: int) -> None:
     """The room as a mesh and a scene, a path in it, and rays of 40 participants who look around."""
     from nerg_mi.formats.ply import write_columns
-    from nerg_mi.rays.rays import Rays
+    from nerg_mi.tracking.rays import Rays
 
     from tests.aoi.place import write_place
     from tests.surfaces.meshes import box
@@ -57,27 +57,25 @@ def room(folder: Path, observers: int, count: int) -> None:
 def bake(folder: Path, detail: float, name: str, **overrides) -> tuple[int, bytes]:
     """Observers and the bytes of the results."""
     from nerg_mi.scenes import store
-    from nerg_mi.workflows.bake import bake
-    from nerg_mi.workflows.scene_commands import BakeOptions
+    from nerg_mi.surfaces.bake import bake
+    from nerg_mi.tasks.settings import Parallel
 
     out = folder / f"{name}.ply"
     gaze = files(store) / "shoppers.safetensors"
-    options = BakeOptions(
-        gaze=gaze, observer_file=folder / "path.csv", max_edge=detail, max_angle=2.0, mode="llvm_ad_rgb", **overrides
-    )
-    result = bake(folder / "room.ply", [out], options)
+    parallel, path = Parallel(**overrides), folder / "path.csv"
+    result = bake(folder / "room.ply", gaze=gaze, observer_file=path, max_edge=detail, parallel=parallel)
+    result.save(out)
     return len(result.mesh.faces), out.read_bytes()
 
 
 def count(folder: Path, name: str, **overrides) -> tuple[int, bytes]:
     """Rays and the bytes of the table."""
-    from nerg_mi.aoi.options import StatisticsOptions
-    from nerg_mi.workflows.statistics import statistics as stats
+    from nerg_mi.aoi.statistics import statistics as stats
+    from nerg_mi.tasks.settings import Parallel
 
-    options = StatisticsOptions(
-        aois=folder / "areas.json", resamples=199, show_names=True, mode="llvm_ad_rgb", **overrides
-    )
-    stats([folder / "scene.xml", folder / "rays.npz"], folder / name, options)
+    files, parallel = [folder / "scene.xml", folder / "rays.npz"], Parallel(**overrides)
+    result = stats(files, folder / "areas.json", resamples=199, show_names=True, parallel=parallel)
+    result.save(folder / name)
     return 0, (folder / name / "aois.csv").read_bytes()
 
 
@@ -92,9 +90,6 @@ def main() -> None:
     )
     parser.add_argument(
         "--rays", type=int, default=1_500_000, help="Number of gaze samples of the statistics. Default: %(default)s."
-    )
-    parser.add_argument(
-        "--out", type=Path, default=Path("out/benchmarks/scaling"), help="Folder for the results. Default: %(default)s."
     )
     args = parser.parse_args()
     os.environ["PYTHONPATH"] = str(ROOT)
@@ -143,8 +138,7 @@ def main() -> None:
         "besides a part": "overhead per task",
         "output of a part": "output per task",
     }
-    print_table("Measured", [titles.get(key, key) for key in rows[0]], [list(row.values()) for row in rows])
-    write_rows(args.out / "scaling.csv", rows)
+    save_result("scaling", [titles.get(key, key) for key in rows[0]], [list(row.values()) for row in rows])
 
 
 if __name__ == "__main__":

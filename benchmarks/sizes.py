@@ -5,20 +5,17 @@ Each `Growth` has programs by size. They use the demo store unless stated otherw
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 
 import nerg_mi as nerg
-from nerg_mi.figures.style import INK, new_page
-from nerg_mi.workflows.demo import find_store_scene
+from nerg_mi.scenes.store import SCENE_FILE
 from torch_frames import camera_rays
 
 import numpy as np
 
 OBSERVER = (4.4, 2.8, 1.6)
-_OURS, _SLOPE = "#1f5fa8", "#b9b9b9"
-_PANEL = (330, 250)
 
 
 @dataclass(frozen=True)
@@ -35,7 +32,7 @@ def frames(width: int, height: int, spp: int = 1, **values) -> Callable[[], np.n
     """A function that renders colour, depth and gaze of the store with ``spp`` samples."""
     import mitsuba as mi
 
-    scene = nerg.Scene.load(find_store_scene(), width=width, height=height, aovs="depth,gaze", **values).mitsuba
+    scene = nerg.Scene.load(SCENE_FILE, width=width, height=height, aovs="depth,gaze", **values).mitsuba
     return lambda: np.array(mi.render(scene, sensor=0, spp=spp))
 
 
@@ -51,7 +48,7 @@ def samples(long: bool) -> Growth:
 
 
 def observers(long: bool) -> Growth:
-    scene = nerg.Scene.load(find_store_scene(), width=320, height=180)
+    scene = nerg.Scene.load(SCENE_FILE, width=320, height=180)
     some = np.asarray(OBSERVER) + np.random.default_rng(0).uniform(-0.4, 0.4, (32, 3)) * (1, 1, 0.2)
     counts = (1, 2, 4, 8, *((16, 32) if long else ()))
     requested = partial(nerg.render, scene, quantities=["depth", "gaze"], spp=1)
@@ -59,7 +56,7 @@ def observers(long: bool) -> Growth:
 
 
 def rays(long: bool) -> Growth:
-    scene = nerg.Scene.load(find_store_scene(), width=320, height=180)
+    scene = nerg.Scene.load(SCENE_FILE, width=320, height=180)
     o, d = camera_rays(640, 360)
     order = np.random.default_rng(0).permutation(len(o))
     counts = (1 << 13, 1 << 15, 1 << 17, *((len(o),) if long else ()))
@@ -132,17 +129,17 @@ def table(long: bool) -> Growth:
     """Density of random fields at the same points."""
     from nerg_mi.fields.encoding import HashGridConfig
     from nerg_mi.fields.mlp import namespace
-    from nerg_mi.fields.radiance import RadianceConfig, RadianceField
+    from nerg_mi.fields.radiance import RadianceConfig, RadianceNetwork
     from nerg_mi.formats.fields import load_radiance
 
     import mitsuba as mi
 
     ns = namespace(mi.variant())
-    store = load_radiance(find_store_scene().parent / "store.safetensors", ns)[0]
+    store = load_radiance(SCENE_FILE.parent / "store.safetensors", ns)[0]
     p, works = random_points(store, 1 << 17), {}
     for log2_rows in (12, 14, 16, 18, *((20, 22) if long else ())):
         grid = HashGridConfig(levels=8, log2_rows=log2_rows, base=32, finest=512)
-        field = RadianceField.random(RadianceConfig(grid, width=32, color_hidden=1), store.box, ns)
+        field = RadianceNetwork.random(RadianceConfig(grid, width=32, color_hidden=1), store.box, ns)
         works[2**log2_rows] = density_work(field, p)
     return Growth("density at 131,072 points in no order", "rows a level", "below 1", works)
 
@@ -151,42 +148,3 @@ def growths(long: bool) -> Iterator[Growth]:
     """All of them; ``long``: larger sizes, too."""
     for make in (pixels, samples, observers, rays, extent, table):
         yield make(long)
-
-
-def _short(size: float) -> str:
-    """A size as a tick label: 230k, 2.1M."""
-    for unit, letter in ((1e6, "M"), (1e3, "k")):
-        if size >= unit:
-            return f"{size / unit:.{1 if size < 10 * unit else 0}f}{letter}"
-    return f"{size:g}"
-
-
-def growth_figure(curves: Sequence[Mapping]):
-    """A panel for each of ``curves``: ``title``, ``axis``, ``sizes`` (n,), ``low``, ``middle`` and ``high`` (n,)
-    milliseconds, and the fitted ``exponent``; logarithmic axes, with the proportional slope in grey."""
-    from matplotlib.ticker import FuncFormatter, LogLocator
-
-    columns = 3
-    rows = -(-len(curves) // columns)
-    figure = new_page(columns * _PANEL[0], rows * _PANEL[1])
-    panels = figure.subplots(rows, columns, squeeze=False).ravel()
-    for axes, curve in zip(panels, curves):
-        sizes, middle = (np.asarray(curve[k], float) for k in ("sizes", "middle"))
-        axes.plot(sizes, middle[-1] * sizes / sizes[-1], color=_SLOPE, linewidth=1, linestyle="--")
-        ends = [np.asarray(curve[k], float) for k in ("low", "high")]
-        axes.errorbar(sizes, middle, [middle - ends[0], ends[1] - middle], color=_OURS, marker="o", ms=3, lw=1.2)
-        axes.set_xscale("log")
-        axes.set_yscale("log")
-        axes.set_xticks(sizes, [_short(n) for n in sizes])
-        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:,g}"))
-        axes.minorticks_off()
-        axes.set_title(curve["title"], fontsize=8, color=INK)
-        axes.set_xlabel(curve["axis"], fontsize=7, color=INK)
-        axes.set_ylabel(curve.get("unit", "CPU ms"), fontsize=7, color=INK)
-        axes.tick_params(labelsize=6, colors=INK, length=2)
-        axes.text(0.04, 0.9, f"size^{curve['exponent']:.2f}", transform=axes.transAxes, fontsize=8, color=_OURS)
-    for axes in panels[len(curves) :]:
-        axes.set_visible(False)
-    figure.tight_layout()
-    return figure

@@ -1,7 +1,7 @@
 """The demo store as Gaussian splats, compared with its field and its shapes, and their speed with Mitsuba's renderer.
 
     python benchmarks/splats.py [--resolution 208] [--width 180] [--runs 5] [--picture FILE.png]
-    [--out out/benchmarks/splats.csv]
+    [--out out/benchmarks/splats]
 
 The splats are made of the trained field as by `nerg export splats`, or read from ``--splats``. The first table compares
 field and splats with exact ray casts at the store's mesh, as store_visibility.py does. A line below it has the
@@ -23,7 +23,7 @@ from pathlib import Path
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 from store_visibility import PAIRS, measure
-from timing import print_table, write_rows
+from timing import save_result
 
 import numpy as np
 
@@ -44,18 +44,18 @@ COLUMNS = {
 def make(path: Path, resolution: int) -> None:
     """Splats of the store's field."""
     from nerg_mi.environment.conversion import export_splats
-    from nerg_mi.workflows.demo import find_store_scene
+    from nerg_mi.scenes.store import SCENE_FILE
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    export_splats(find_store_scene().parent / "store.safetensors", resolution=resolution).save(path)
+    export_splats(SCENE_FILE.parent / "store.safetensors", resolution=resolution).save(path)
 
 
 def splat_scene(folder: Path) -> Path:
     """The store's scene with splats as its field, written to ``folder``."""
-    from nerg_mi.workflows.demo import find_store_scene
+    from nerg_mi.scenes.store import SCENE_FILE
 
     path = folder / "splats.xml"
-    text = find_store_scene().read_text()
+    text = SCENE_FILE.read_text()
     path.write_text(text.replace('name="field" type="nerf"', 'name="field" type="splats"'))
     return path
 
@@ -176,21 +176,21 @@ def main(argv=None) -> None:
     parser.add_argument("--runs", type=int, default=5, help="Number of timed runs. Default: %(default)s.")
     parser.add_argument("--picture", type=Path, help="PNG file to write. Default: none.")
     parser.add_argument(
-        "--out", type=Path, default=Path("out/benchmarks/splats.csv"), help="CSV file to write. Default: %(default)s."
+        "--out", type=Path, default=Path("out/benchmarks/splats"), help="Folder for files. Default: %(default)s."
     )
     args = parser.parse_args(argv)
 
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
-    from nerg_mi.workflows.demo import find_store_scene
+    from nerg_mi.scenes.store import SCENE_FILE
 
-    folder = args.out.parent
+    folder = args.out
     folder.mkdir(parents=True, exist_ok=True)
     if args.splats is None:
         args.splats = folder / "store.ply"
         make(args.splats, args.resolution)
-    store = find_store_scene()
+    store = SCENE_FILE
     gaze = {"gaze": str((store.parent / "shoppers.safetensors").resolve())}
     files = gaze | {"field": str(args.splats.resolve())}
     scenes = {"field": (store, gaze), "splats": (splat_scene(folder), files)}
@@ -211,7 +211,7 @@ def main(argv=None) -> None:
                 ),
             ]
         )
-    print_table("Against exact ray casts", ("", *COLUMNS.values()), rows)
+    save_result("splats-exact", ("environment", *COLUMNS.values()), rows)
     separate = same_depth(scenes, args.width)
     medians, same = ([row[key] for row in separate] for key in ("median cm", "same"))
     print(
@@ -220,9 +220,7 @@ def main(argv=None) -> None:
     )
     speed = times(scenes["splats"][0], files, args.runs)
     rows = [[r["what"], f"{r['s']:.2f}", f"{r['CPU s']:.2f} s", f"{r['of volprim']:.2g}"] for r in speed]
-    print_table(f"Time for {SIZE[0]} x {SIZE[1]} pixels", ("", "time, s", "CPU time", f"relative to `{PEER}`"), rows)
-    write_rows(args.out, speed)
-    write_rows(args.out.with_name("splats_exact.csv"), exact)
+    save_result("splats-time", ("outputs", "time, s", "CPU time", f"relative to `{PEER}`"), rows)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Gaussian splats fitted to photos through ``mi.render``: PSNR of held-out views before and after, time, memory.
 
     python benchmarks/splats_fit.py [--resolution 96] [--views 24] [--width 96] [--steps 150] [--rays 8192] [--seeds 3]
-    [--update docs/explanation/environment-accuracy.md]
+
 
 The photos are renderings of the demo store's mesh from a photographer's cameras, chosen as for the store's field. Eight
 other photos, from a shopper's eye, select the learning rates: `RATES` times one of `FACTORS`, for the disturbed splats
@@ -38,7 +38,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from nerg_mi.fields.splats import Splats, harmonics_from_colors, multiply_quaternions
 from nerg_mi.figures.overlay import srgb
 from nerg_mi.registration import get_plugin_class
-from timing import print_table
+from timing import save_result
 
 import drjit as dr
 import mitsuba as mi
@@ -227,11 +227,6 @@ def main(argv=None) -> None:
         type=int,
         help="Print only the memory in MB for this number of hits per ray, measured in this process. Default: none.",
     )
-    parser.add_argument(
-        "--update",
-        type=Path,
-        help="Page of the manual whose tables below the same headings are replaced. Default: none.",
-    )
     args = parser.parse_args(argv)
     mi.set_variant("llvm_ad_rgb")
     if args.hits:
@@ -248,9 +243,7 @@ def main(argv=None) -> None:
     tried = {factor: fitted(disturbed(splats), photos, args, factor, 0) for factor in FACTORS}
     factor = max(tried, key=lambda f: tried[f]["choosing"])
     rows = [[f"{f:g}", f"{row['choosing']:.2f}"] for f, row in tried.items()]
-    print_table(
-        "PSNR of validation photos by learning rate", ["factor of the learning rate", "PSNR, dB"], rows, args.update
-    )
+    save_result("splats-fit-rates", ["factor of the learning rate", "PSNR of validation photos, dB"], rows, "0")
     kinds = {"as they are": lambda seed: splats, "disturbed": lambda seed: disturbed(splats, seed)}
     rows = []
     for name, of_seed in kinds.items():
@@ -262,13 +255,13 @@ def main(argv=None) -> None:
         rows.append([name, *summary(result)])
     head = ["splats", "held-out photos, before", "after", "training photos, before", "after"]
     head += ["time, s", "CPU time per step, ms", "peak memory, MB"]
-    print_table("PSNR of photos, dB", head, rows, args.update)
+    save_result("splats-fit", head, rows, f"0 to {args.seeds - 1}")
     rows = []
     for hits in HITS:
         command = [sys.executable, __file__, "--hits", str(hits)]
         result = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout.strip()
         rows.append([f"{hits:,}", result])
-    print_table("Memory of a derivative", ["hits per ray", "peak memory, MB"], rows, args.update)
+    save_result("splats-fit-memory", ["hits per ray", "peak memory, MB"], rows)
 
 
 if __name__ == "__main__":

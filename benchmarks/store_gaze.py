@@ -1,6 +1,6 @@
 """The store's trained gaze field compared with the true law, at positions without nearby training rays.
 
-    python benchmarks/store_gaze.py [--gaze FILE] [--field FILE] [--rays FILE] [--out out/benchmarks/store_gaze.csv]
+    python benchmarks/store_gaze.py [--gaze FILE] [--field FILE] [--rays FILE]
 
 The test positions are those that the gaze checkpoint lists as held out (`nerg train gaze --test-zones`). Shoppers were
 there, and all rays within 2R were excluded from the training. The truth is the attention law in closed form, in 2,048
@@ -37,7 +37,7 @@ def fresh_draws(law, count: int, kappa: float):
 
 
 def main(argv=None) -> None:
-    from timing import print_table, write_rows
+    from timing import save_result
 
     import mitsuba as mi
 
@@ -48,12 +48,12 @@ def main(argv=None) -> None:
     from nerg_mi.fields.mlp import namespace
     from nerg_mi.formats.fields import load_gaze
     from nerg_mi.maths.sphere import fibonacci_directions
-    from nerg_mi.rays.filters import purge
-    from nerg_mi.rays.rays import Rays
     from nerg_mi.scenes import store
     from nerg_mi.scenes.store.attention_law import AttentionLaw
+    from nerg_mi.tracking.filters import purge
+    from nerg_mi.tracking.rays import Rays
     from nerg_mi.train.gaze_data import find_hit_points
-    from nerg_mi.train.radiance_settings import use_current_names
+    from nerg_mi.train.trainer import use_current_names
 
     local = Path(store.__file__).resolve().parent
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -74,12 +74,6 @@ def main(argv=None) -> None:
         type=Path,
         default=local / "build" / "rays.npz",
         help="Gaze samples of the training. Default: those of the store's shoppers.",
-    )
-    parser.add_argument(
-        "--out",
-        type=Path,
-        default=Path("out/benchmarks/store_gaze.csv"),
-        help="CSV file to write. Default: %(default)s.",
     )
     args = parser.parse_args(argv)
 
@@ -108,16 +102,14 @@ def main(argv=None) -> None:
     for name, method in methods.items():
         maps = method(positions, directions)
         rows.append({"method": name, **compute_map_scores(truth, maps), "integral": float(4 * np.pi * np.mean(maps))})
-    title = f"{len(positions)} held-out positions against the ground truth"
-    title += f" (trained on {len(train):,} of {len(rays):,} rays)"
+    print(f"{len(positions)} held-out positions; trained on {len(train):,} of {len(rays):,} rays")
     table = [[r["method"], *(f"{r[k]:.3f}" for k in ("KLD", "CC", "SIM")), f"{r['MAE']:.4f}"] for r in rows]
-    print_table(title, ("", "KLD", "CC", "SIM", "MAE, 1/sr"), table)
+    save_result("gaze-store-law", ("method", "KLD", "CC", "SIM", "MAE, 1/sr"), table)
     integral = 4 * np.pi * methods["gaze field"](positions, directions).mean(axis=1)
     print(
         f"integral of the gaze field over the sphere: mean {integral.mean():.3f}, "
         f"{integral.min():.3f} to {integral.max():.3f}; KLD with eps {EPS:g} of the uniform density"
     )
-    write_rows(args.out, rows)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Visibility and depth of the store's field, compared with exact ray casts at its mesh (the twin).
 
-    python benchmarks/store_visibility.py [--field FILE] [--width 240] [--out out/benchmarks/store_visibility.csv]
+    python benchmarks/store_visibility.py [--field FILE] [--width 240]
 
 For several pairs of a camera and an observer, the integrator `nerg` renders depth, position and visibility (fall-off 0,
 one ray per pixel). The same rays are cast at the twin. A pixel is correct if its visibility is 1 where the observer
@@ -139,7 +139,7 @@ def table(rows: list[dict]) -> list[list[str]]:
 
 
 def main(argv=None) -> None:
-    from timing import print_table, write_rows
+    from timing import save_result
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--field", type=Path, help="Checkpoint of the radiance field. Default: that of the store.")
@@ -176,30 +176,23 @@ def main(argv=None) -> None:
         choices=list(PAIRS),
         help="Pair of camera and observer; can be repeated. Default: all.",
     )
-    parser.add_argument(
-        "--out",
-        type=Path,
-        default=Path("out/benchmarks/store_visibility.csv"),
-        help="CSV file to write. Default: %(default)s.",
-    )
     args = parser.parse_args(argv)
 
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
-    from nerg_mi.workflows.demo import find_store_scene
+    from nerg_mi.scenes.store import SCENE_FILE
 
     files = {k: str(v.resolve()) for k, v in (("field", args.field), ("gaze", args.gaze)) if v is not None}
     rows = [
-        measure(find_store_scene(), pair, kind, visibility, files, args.width, args.margin)
+        measure(SCENE_FILE, pair, kind, visibility, files, args.width, args.margin)
         for visibility in args.visibility.split(",")
         for kind in args.kinds.split(",")
         for pair in args.pair or PAIRS
     ]
     head = ("depth", "visibility", "wrong visibility away from silhouettes, %", "wrong visibility, %")
     head += ("pixels away from silhouettes", *CENTIMETRES.values())
-    print_table("Visibility and depth against exact ray casts", head, table(rows))
-    write_rows(args.out, rows)
+    save_result("store-visibility", head, table(rows))
 
 
 if __name__ == "__main__":

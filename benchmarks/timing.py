@@ -8,25 +8,13 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
-from nerg_mi.files.tables import format_markdown_table, write_csv
-
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from tools.page import update_table
+from tools import results
+from tools.results import save as save_result
 
-
-def write_rows(path: Path, rows: list[dict]) -> None:
-    """Write ``rows`` as CSV, and print the path."""
-    write_csv(path, rows)
-    print(f"wrote {path}")
-
-
-def print_table(title: str, head: Sequence[str], rows: Sequence[Sequence], page: Path | None = None) -> None:
-    """Print a table below its heading, and insert it into the ``page`` of the manual with this heading."""
-    print(f"### {title}\n")
-    update_table(page, title, format_markdown_table(head, rows))
-    print(flush=True)
+__all__ = ["Times", "at_the_end", "exponent", "in_turns", "median", "results", "save_result", "spread"]
 
 
 median = statistics.median

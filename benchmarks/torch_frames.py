@@ -31,7 +31,7 @@ if "drjit" not in sys.modules:
 import nerg_mi as nerg
 from nerg_mi.figures.overlay import srgb
 from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.workflows.demo import find_store_scene
+from nerg_mi.scenes.store import SCENE_FILE
 from timing import in_turns, median, spread
 from torch_radiance import _PRIMES, TorchModel, harmonics
 
@@ -247,7 +247,7 @@ def camera_rays(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
     """Origins and unit directions (width * height, 3) of the pixel centres of the scene's first sensor."""
     import mitsuba as mi
 
-    sensor = nerg.Scene.load(find_store_scene(), width=width, height=height).mitsuba.sensors()[0]
+    sensor = nerg.Scene.load(SCENE_FILE, width=width, height=height).mitsuba.sensors()[0]
     x, y = np.meshgrid((np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height)
     at = mi.Point2f(x.ravel().astype(np.float32), y.ravel().astype(np.float32))
     ray, _ = sensor.sample_ray(0, 0.5, at, mi.Point2f(0.5), True)
@@ -285,7 +285,7 @@ class Ours:
     def __init__(self, values: dict, visibility: str, constant: bool = False, moves: bool = False):
         import mitsuba as mi
 
-        scene = nerg.Scene.load(find_store_scene(), **{**PEER_SCENE, **values}, visibility=visibility)
+        scene = nerg.Scene.load(SCENE_FILE, **{**PEER_SCENE, **values}, visibility=visibility)
         if constant:
             scene.set_constant_weights()
         self.render = partial(mi.render, scene.mitsuba, sensor=0, spp=1)

@@ -1,13 +1,12 @@
-"""Training of a radiance field compared with a plain PyTorch trainer: steps per second, and PSNR after equal time.
+"""Time of a training step of a radiance field, compared with a plain PyTorch trainer.
 
-    python benchmarks/torch_radiance.py [--minutes 2] [--width 135] [--validate] [--data DIR] [--turns 0]
+    python benchmarks/torch_radiance.py [--width 135] [--data DIR] [--turns 9] [--threads 2]
 
 Both trainers have the same grid, networks, initial weights, rays, steps along a ray, occupancy grid, density pre-pass,
-losses, optimiser and schedule. They run one after the other on the same machine. The reference is eager PyTorch with
+losses, optimiser and schedule, with fine steps along the ray from the start. The reference is eager PyTorch with
 gathers, sums and autograd. Both first evaluate the same random points, and the program stops if the results differ.
 Additional features of nerg's trainer are disabled: thinned samples, damped derivatives near cameras, cleared cells,
-per-photo colours, and occupancy extraction. The integrator scores both fields, with the same method to find occupied
-cells.
+per-photo colours, and occupancy extraction.
 """
 
 from __future__ import annotations
@@ -21,14 +20,17 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
-from radiance import FOX, open_views
-from timing import in_turns, median, spread
+from radiance import FOX
+from timing import in_turns, median, save_result, spread
 
 import numpy as np
 
 
-def take_turns(ours, peer, turns: int, steps: int = 8, before: int = 100) -> None:
-    """Print the time per step of each, in ``turns`` of ``steps``, after ``before`` steps that clear the initial fog."""
+def take_turns(ours, peer, turns: int, result: str, steps: int = 8, before: int = 100) -> None:
+    """Save the time per step of each as ``result``, in ``turns`` of ``steps``.
+
+    ``before`` steps clear the initial fog.
+    """
 
     def some(trainer, count: int) -> None:
         for _ in range(count):
@@ -38,14 +40,15 @@ def take_turns(ours, peer, turns: int, steps: int = 8, before: int = 100) -> Non
     for trainer in (ours, peer):
         some(trainer, before)
     taken = in_turns(works, turns)
+    rows = []
+    first = [median(t) for t in zip(*taken["nerg_mi"])]
     for name, times in taken.items():
-        wall, cpu = (median(t) / steps for t in zip(*times))
-        print(
-            f"{name}: {1e3 * cpu:.1f} ms of CPU time per step "
-            f"({1e3 * wall:.1f} ms; {spread(c / steps for _, c in times)} s)"
-        )
-    ratios = [median(t[k] for t in taken["PyTorch"]) / median(t[k] for t in taken["nerg_mi"]) for k in (1, 0)]
-    print(f"PyTorch takes {ratios[0]:.1f} times our CPU time, {ratios[1]:.1f} times our wall-clock time")
+        wall, cpu = (median(t) for t in zip(*times))
+        ratios = [f"{value / ours:.1f}" for value, ours in zip((wall, cpu), first)]
+        quartiles = spread(1e3 * c / steps for _, c in times)
+        rows.append([name, f"{1e3 * wall / steps:.1f}", f"{1e3 * cpu / steps:.1f}", quartiles, *ratios])
+    head = ["trainer", "time per step, ms", "CPU time, ms", "quartiles of CPU time, ms"]
+    save_result(result, [*head, "relative time", "relative CPU time"], rows)
 
 
 _PRIMES = (1, 2654435761, 805459861)
@@ -298,14 +301,9 @@ def same_model(trainer, peer) -> float:
 
 
 def main(argv=None) -> None:
-    from timing import write_rows
-
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
         "--data", type=Path, default=FOX, help="Folder of the posed images. Default: the fox of NERG_DATA."
-    )
-    parser.add_argument(
-        "--minutes", type=float, default=2.0, help="Training time of each trainer in minutes. Default: %(default)s."
     )
     parser.add_argument("--width", type=int, default=135, help="Width of the photos in pixels. Default: %(default)s.")
     parser.add_argument(
@@ -313,82 +311,36 @@ def main(argv=None) -> None:
     )
     parser.add_argument("--threads", type=int, default=2, help="Number of CPU threads. Default: %(default)s.")
     parser.add_argument(
-        "--validate",
-        action="store_true",
-        help="Score every 8th training view, which is then not trained on, instead of the held-out views.",
-    )
-    parser.add_argument(
         "--turns",
         type=int,
-        default=0,
-        help="Compare only the time per step: both trainers alternate this many times for 8 steps each, after 100 "
-        "steps that clear the initial fog, with fine steps along the ray from the start. Default: %(default)s (train "
-        "and score).",
-    )
-    parser.add_argument(
-        "--out",
-        type=Path,
-        default=Path("out/benchmarks/torch_radiance"),
-        help="Folder for the results. Default: %(default)s.",
+        default=9,
+        help="Both trainers alternate this many times for 8 steps each, after 100 steps that clear the initial fog. "
+        "Default: %(default)s.",
     )
     args = parser.parse_args(argv)
 
-    from nerg_mi.evaluation.metrics import score_views
-    from nerg_mi.formats.fields import save_radiance
+    from nerg_mi.cli.declarations import select_backend
+    from nerg_mi.photos.dataset import open_dataset
     from nerg_mi.train.radiance_settings import RadianceSettings, make_radiance_config
     from nerg_mi.train.radiance_trainer import RadianceTrainer
-    from nerg_mi.workflows.base import select_backend
 
     import torch
 
     ns = select_backend("llvm_ad_rgb", args.threads)
     torch.set_num_threads(args.threads)
-    data = open_views(args.data, args, args.width)
+    data = open_dataset(args.data, None, args.width)
     if any(v.has_alpha or v.mask is not None for v in data.train):
         raise SystemExit("the peer knows neither alpha nor masks; give a set of plain photos")
-    fine = {"strides": ()} if args.turns else {}
-    settings = RadianceSettings(minutes=args.minutes, **OFF, **fine)
+    settings = RadianceSettings(minutes=60, strides=(), **OFF)
     make = lambda: RadianceTrainer(
         data.train, data.box, make_radiance_config(args.size, data.box), settings, ns, depth=False
     )
-    args.out.mkdir(parents=True, exist_ok=True)
-    ours, judge = make(), make()
-    peer = TorchTrainer(judge, data.train)
+    ours, peer = make(), TorchTrainer(make(), data.train)
     difference = same_model(ours, peer.model)
     print(f"same weights, same points: densities and colours differ by {difference:.1e} at most")
     if not difference < 1e-3:
         raise SystemExit("the two are not the same model")
-    if args.turns:
-        take_turns(ours, peer, args.turns)
-        return
-    rows = []
-    for name, trainer in (("nerg_mi", ours), ("PyTorch", peer)):
-        load = os.getloadavg()[0]
-        for _ in range(3):  # compiled, and warm
-            trainer.step()
-        trainer.start()
-        while trainer.progress < 1:
-            trainer.step()
-        seconds, steps = trainer.seconds, trainer.steps
-        if trainer is peer:
-            judge.averaged = {k: type(v)(peer.averaged[k].numpy()) for k, v in judge.averaged.items()}
-        path = args.out / f"{name}.safetensors"
-        save_radiance((judge if trainer is peer else ours).make_field(), path, {"trainer": name})
-        scores = score_views(path, data.held_out, 4)
-        rows.append(
-            {
-                "trainer": name,
-                "minutes": args.minutes,
-                "steps": steps,
-                "steps_per_s": round(steps / seconds, 2),
-                "psnr": round(scores.psnr_mean, 2),
-                "ssim": round(scores.ssim_mean, 4),
-                "load_before": round(load, 1),
-            }
-        )
-        print(rows[-1], flush=True)
-    print(f"steps per second: {rows[0]['steps_per_s'] / rows[1]['steps_per_s']:.1f} times PyTorch's")
-    write_rows(args.out / "torch_radiance.csv", rows)
+    take_turns(ours, peer, args.turns, f"training-step-{args.threads}")
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import io
-import os
 import tempfile
 import threading
 import time
@@ -63,12 +62,11 @@ def measure(scene: Path, width: int, seconds: float, compile: bool, folder: Path
     """Rows of the table: a moving camera, and a moving observer."""
     from nerg_mi.viewer.page import REST_SECONDS, BrowserWindow, Page
     from nerg_mi.viewer.points import PinholeView
-    from nerg_mi.viewer.session import Session
-    from nerg_mi.workflows.scene_commands import ViewOptions
-    from nerg_mi.workflows.view import make_viewer_scene
+    from nerg_mi.viewer.session import Session, SessionSettings
+    from nerg_mi.viewer.source import open_viewer_scene
 
-    options = ViewOptions(width=width, compile=compile)
-    session = Session(lambda: make_viewer_scene([scene], folder, options), options, Listener())
+    settings = SessionSettings(width=width, compile=compile)
+    session = Session(lambda: open_viewer_scene(scene, folder), settings, Listener())
     session.start()
     try:
         while compile and session.compiled is None:
@@ -115,7 +113,7 @@ def measure(scene: Path, width: int, seconds: float, compile: bool, folder: Path
 
 
 def main(argv=None) -> None:
-    from timing import print_table
+    from timing import save_result
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", type=Path)
@@ -126,8 +124,7 @@ def main(argv=None) -> None:
     with tempfile.TemporaryDirectory() as folder:
         for compile in (True, False):
             rows += measure(args.scene, args.width, args.seconds, compile, Path(folder))
-    title = f"Images of a moving view, load {os.getloadavg()[0]:.1f}, {os.cpu_count()} cores"
-    print_table(title, ("density", "moving", "usual size", "images a second", "full resolution, s"), rows)
+    save_result("viewer", ("density", "moving", "usual size", "images a second", "full resolution, s"), rows)
 
 
 if __name__ == "__main__":

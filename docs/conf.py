@@ -1,15 +1,21 @@
 """Sphinx configuration of the manual (`make manual`). Neither the build nor a page uses the network.
 
-The source folder is the whole checkout, so that links between pages, notebooks and files also work on a code host.
+The source folder is the whole checkout, so that links between pages, notebooks and files also work on a code host. The
+pages in docs/reference are written from the code when a build starts.
 """
 
+import os
 import re
+import sys
 from pathlib import Path
 
 from docutils import nodes
 from docutils.utils.math.latex2mathml import tex2mathml
 
 from nerg_mi import __version__
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from tools import reference, results
 
 project = "nerg_mi"
 author = "The authors of nerg_mi"
@@ -60,14 +66,41 @@ html_theme_options = {"navigation_with_keys": True}
 
 
 def add_contents(app, page, source):
-    """Add hidden tables of contents: one per heading of docs/index.md, with the pages listed below it."""
+    """Add a table of contents to each section of docs/index.md: hidden, with the pages listed there; or visible, with
+    the pages of the reference, to which the repository has no links."""
     if page != root_doc:
         return
-    for part in re.split(r"^## ", source[0], flags=re.M)[1:]:
-        title, _, body = part.partition("\n")
-        targets = re.findall(r"^- \[[^\]]*\]\(([^()#\s]+)", body, flags=re.M)
+    parts = re.split(r"^(?=## )", source[0], flags=re.M)
+    for k, part in enumerate(parts[1:], 1):
+        title = part.partition("\n")[0].removeprefix("## ")
+        targets = re.findall(r"^- \[[^\]]*\]\(([^()#\s]+)", part, flags=re.M)
         entries = [f"/{Path('docs', target)}".replace("/docs/../", "/").rsplit(".", 1)[0] for target in targets]
-        source[0] += "\n" + "\n".join(["```{toctree}", ":hidden:", f":caption: {title}", "", *entries, "```"]) + "\n"
+        options = ":hidden:"
+        if title == "Reference":
+            entries, options = [f"/docs/reference/{name}" for name in reference.PAGES], ":maxdepth: 1"
+        parts[k] += "\n".join(["```{toctree}", options, f":caption: {title}", "", *entries, "```", "", ""])
+    source[0] = "".join(parts)
+
+
+def link_reference(app, page, source):
+    """Lead links to a file whose docstring is a section of the reference to that section."""
+    folder = Path(page).parent
+    sections = reference.find_sections()
+
+    def target(match):
+        path = os.path.normpath(folder / match[1])
+        return (
+            f"]({os.path.relpath(reference.FOLDER / sections[path], reference.ROOT / folder)})"
+            if path in sections
+            else match[0]
+        )
+
+    source[0] = re.sub(r"\]\(([\w./-]+\.py)\)", target, source[0])
+
+
+def add_results(app, page, source):
+    """Insert the tables of benchmarks at their markers."""
+    source[0] = results.insert(source[0])
 
 
 def add_inline(writer, node):
@@ -83,6 +116,9 @@ def add_displayed(writer, node):
 
 
 def setup(app):
+    app.connect("config-inited", lambda app, config: reference.write_pages())
     app.connect("source-read", add_contents)
+    app.connect("source-read", add_results)
+    app.connect("source-read", link_reference)
     app.add_html_math_renderer("mathml", (add_inline, None), (add_displayed, None))
     return {"parallel_read_safe": True, "parallel_write_safe": True}

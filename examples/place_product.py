@@ -4,10 +4,10 @@
 
 A box is placed at the front edge of a shelf of the demo store. Simulated shoppers pass by, and the gaze field predicts
 where they look. The expected probability of looking at the box is an integral over the points of its surface
-(``nerg_mi.probes.surface_attention``), so automatic differentiation gives its derivative with respect to the position
-of the box, through distance, direction, gaze networks and fall-off. Gradient ascent runs from several starts; a sweep
-along the whole shelf verifies the optima, and central differences verify the derivatives. The moving edges of other
-occluders are not differentiated; the resulting error is measured.
+(``nerg_mi.environment.surface_attention``), so automatic differentiation gives its derivative with respect to the
+position of the box, through distance, direction, gaze networks and fall-off. Gradient ascent runs from several starts;
+a sweep along the whole shelf verifies the optima, and central differences verify the derivatives. The moving edges of
+other occluders are not differentiated; the resulting error is measured.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ class Attention:
     """Expected attention of observers on a box on a shelf, and its derivative."""
 
     def __init__(self, shelf: Shelf, heads: np.ndarray, settings: Settings, falloff: float = 0.05):
-        from nerg_mi.probes.surface_attention import make_patches
+        from nerg_mi.environment.surface_attention import make_patches
         from nerg_mi.scenes.store.attention_law import FOLDER
         from nerg_mi.transport.geometry import SceneGeometry
 
@@ -120,7 +120,7 @@ class Attention:
         return self.gaze.evaluate(p_od, p_o, r_o, active)[0]
 
     def _evaluate_patches(self, at, density):
-        from nerg_mi.probes.surface_attention import attention_per_patch
+        from nerg_mi.environment.surface_attention import attention_per_patch
 
         import mitsuba as mi
 
@@ -201,7 +201,7 @@ def elevation(attention: Attention, at: float, spacing: float):
     """Render the front view of the shelf with the box at ``at``: albedo (h, w, 3), attention (h, w) in 1/m², extent in
     metres.
     """
-    from nerg_mi.probes.surface_attention import Patches, attention_per_patch
+    from nerg_mi.environment.surface_attention import Patches, attention_per_patch
     from nerg_mi.scenes.store.attention_law import FOLDER
     from nerg_mi.transport.geometry import SceneGeometry
 

@@ -14,11 +14,8 @@ import io
 import tempfile
 from pathlib import Path
 
-import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
+import nerg_mi as nerg  # chooses the libLLVM, so it comes before drjit and mitsuba
 from nerg_mi.files.atomic import write_bytes
-from nerg_mi.files.tables import write_csv
-from nerg_mi.workflows.render import render_file
-from nerg_mi.workflows.scene_commands import PictureOptions
 
 import numpy as np
 
@@ -36,12 +33,9 @@ def render_walk(out: Path, frames: int, width: int, spp: int) -> Path:
     positions = PATH[0] + along[:, None] * (PATH[1] - PATH[0])
     rows = [{"eye": ", ".join(f"{x:.3f}" for x in eye), "ahead": f"{eye[0] + 0.3:.3f}, 4.4, 1.2"} for eye in positions]
     with tempfile.TemporaryDirectory() as folder:
-        walk = Path(folder) / "walk.csv"
-        write_csv(walk, rows)
         height = str(width * 2 // 3)
         values = {**CAMERA, "width": str(width), "height": height, "spp": str(spp)}
-        options = PictureOptions(overlay="gaze", frames=walk, defaults=values)
-        made = render_file(SCENE, Path(folder) / "walk.png", options)
+        made = nerg.render_film(SCENE, Path(folder) / "walk.png", frames=rows, overlay="gaze", defaults=values)
         pictures = [Image.open(path).convert("RGB") for path in made.files]
     loop, buffer = [*pictures, *pictures[-2:0:-1]], io.BytesIO()
     save_options = {"save_all": True, "append_images": loop[1:], "duration": 1000 // 12, "loop": 0}

@@ -5,7 +5,7 @@
     scene = nerg.make_scene("store.safetensors", "shoppers.safetensors", camera=nerg.Camera((7, 3, 2), (5, 4, 1)))
     pictures = nerg.render(scene, observers=[(4.4, 2.8, 1.6)])
 
-`docs/reference/python.md` introduces the interface; each name of `__all__` has an example in its docstring. A Mitsuba
+docs/how-to/python.md introduces the interface; each name of `__all__` has an example in its docstring. A Mitsuba
 variant that is already set is kept. Otherwise the first call that needs a variant sets ``cuda_ad_rgb`` if it works, and
 ``llvm_ad_rgb`` if not.
 
@@ -26,15 +26,11 @@ from . import registration as _registration
 
 if TYPE_CHECKING:
     from .alignment.align import align
-    from .api.analysis import bake, draw, export_scene, render_film, report, statistics, write_scene
-    from .api.arrays import Camera
-    from .api.evaluation import evaluate_gaze, evaluate_radiance, folds, next_look, study
-    from .api.gaze import load_gaze
-    from .api.query import attention, observe, trace
-    from .api.recordings import check_rays, filter_rays, guess, import_rays, plot_rays, split_rays
-    from .api.render import render
-    from .api.scene import Scene, make_scene
-    from .api.training import train_gaze, train_prior, train_radiance
+    from .aoi.areas import Areas
+    from .aoi.attention import attention
+    from .aoi.bids import export_rays
+    from .aoi.statistics import statistics
+    from .environment.arrays import Camera
     from .environment.contents import DensityGrid
     from .environment.conversion import (
         export_mesh,
@@ -44,76 +40,127 @@ if TYPE_CHECKING:
         export_volume,
         import_checkpoint,
     )
-    from .environment.trained import load_field
+    from .environment.environment import Environment
+    from .environment.gaze import GazeField, load_gaze
+    from .environment.queries import observe, trace
+    from .environment.radiance import RadianceField, load_field
+    from .environment.scene import Scene, make_scene
+    from .environment.scene_file import write_scene
     from .errors import NergError
-    from .rays.dataset import load_rays
-    from .rays.rays import Rays
-    from .rays.readers.registry import register_reader
-    from .train.compile import compile_field
+    from .evaluation.folds import folds
+    from .evaluation.held_out import evaluate_gaze
+    from .evaluation.next_look_scores import next_look
+    from .evaluation.photos import evaluate_radiance
+    from .evaluation.study_run import study
+    from .figures.films import render_film
+    from .figures.floor_plans import draw_floor, plot_rays
+    from .figures.image_files import draw_difference, draw_sheet
+    from .figures.occlusion import draw_sphere, draw_triptych
+    from .figures.pictures import render
+    from .figures.scanpath import draw_scanpath
+    from .formats.alignments import Alignment
+    from .interop.scenes import export_scene
+    from .photos.images import load_photos
+    from .photos.posed import Photos
+    from .reports.report import report
+    from .surfaces.bake import bake
+    from .surfaces.baked import draw_surface
+    from .tracking.dataset import load_rays
+    from .tracking.imports import guess, import_rays
+    from .tracking.measurement import measure_events
+    from .tracking.quality import check_rays
+    from .tracking.rays import Rays
+    from .tracking.readers.registry import register_reader
+    from .tracking.selection import filter_rays
+    from .tracking.splits import split_rays
+    from .train.compile import compile_field, refine_field
+    from .train.gaze import train_gaze
     from .train.gaze_recipes import register_recipe
     from .train.poses import find_poses
-    from .train.refine import refine_field
+    from .train.prior import train_prior
+    from .train.radiance import train_radiance
     from .transport.quadrature import register_quadrature
     from .viewer.serve import view
 
 __version__ = "0.1.0"
 
 _MODULES = {
-    "Camera": "nerg_mi.api.arrays",
+    "Alignment": "nerg_mi.formats.alignments",
+    "Areas": "nerg_mi.aoi.areas",
+    "Camera": "nerg_mi.environment.arrays",
     "DensityGrid": "nerg_mi.environment.contents",
+    "Environment": "nerg_mi.environment.environment",
+    "GazeField": "nerg_mi.environment.gaze",
     "NergError": "nerg_mi.errors",
-    "Rays": "nerg_mi.rays.rays",
-    "Scene": "nerg_mi.api.scene",
+    "Photos": "nerg_mi.photos.posed",
+    "RadianceField": "nerg_mi.environment.radiance",
+    "Rays": "nerg_mi.tracking.rays",
+    "Scene": "nerg_mi.environment.scene",
     "align": "nerg_mi.alignment.align",
-    "attention": "nerg_mi.api.query",
-    "bake": "nerg_mi.api.analysis",
-    "check_rays": "nerg_mi.api.recordings",
+    "attention": "nerg_mi.aoi.attention",
+    "bake": "nerg_mi.surfaces.bake",
+    "check_rays": "nerg_mi.tracking.quality",
     "compile_field": "nerg_mi.train.compile",
-    "draw": "nerg_mi.api.analysis",
-    "evaluate_gaze": "nerg_mi.api.evaluation",
-    "evaluate_radiance": "nerg_mi.api.evaluation",
+    "draw_difference": "nerg_mi.figures.image_files",
+    "draw_floor": "nerg_mi.figures.floor_plans",
+    "draw_scanpath": "nerg_mi.figures.scanpath",
+    "draw_sheet": "nerg_mi.figures.image_files",
+    "draw_sphere": "nerg_mi.figures.occlusion",
+    "draw_surface": "nerg_mi.surfaces.baked",
+    "draw_triptych": "nerg_mi.figures.occlusion",
+    "evaluate_gaze": "nerg_mi.evaluation.held_out",
+    "evaluate_radiance": "nerg_mi.evaluation.photos",
     "export_mesh": "nerg_mi.environment.conversion",
     "export_points": "nerg_mi.environment.conversion",
-    "export_scene": "nerg_mi.api.analysis",
+    "export_rays": "nerg_mi.aoi.bids",
+    "export_scene": "nerg_mi.interop.scenes",
     "export_splats": "nerg_mi.environment.conversion",
     "export_torch_ngp": "nerg_mi.environment.conversion",
     "export_volume": "nerg_mi.environment.conversion",
-    "filter_rays": "nerg_mi.api.recordings",
+    "filter_rays": "nerg_mi.tracking.selection",
     "find_poses": "nerg_mi.train.poses",
-    "folds": "nerg_mi.api.evaluation",
-    "guess": "nerg_mi.api.recordings",
+    "folds": "nerg_mi.evaluation.folds",
+    "guess": "nerg_mi.tracking.imports",
     "import_checkpoint": "nerg_mi.environment.conversion",
-    "import_rays": "nerg_mi.api.recordings",
-    "load_field": "nerg_mi.environment.trained",
-    "load_gaze": "nerg_mi.api.gaze",
-    "load_rays": "nerg_mi.rays.dataset",
-    "make_scene": "nerg_mi.api.scene",
-    "next_look": "nerg_mi.api.evaluation",
-    "observe": "nerg_mi.api.query",
-    "plot_rays": "nerg_mi.api.recordings",
-    "refine_field": "nerg_mi.train.refine",
+    "import_rays": "nerg_mi.tracking.imports",
+    "load_field": "nerg_mi.environment.radiance",
+    "load_gaze": "nerg_mi.environment.gaze",
+    "load_photos": "nerg_mi.photos.images",
+    "load_rays": "nerg_mi.tracking.dataset",
+    "make_scene": "nerg_mi.environment.scene",
+    "measure_events": "nerg_mi.tracking.measurement",
+    "next_look": "nerg_mi.evaluation.next_look_scores",
+    "observe": "nerg_mi.environment.queries",
+    "plot_rays": "nerg_mi.figures.floor_plans",
+    "refine_field": "nerg_mi.train.compile",
     "register_quadrature": "nerg_mi.transport.quadrature",
-    "register_reader": "nerg_mi.rays.readers.registry",
+    "register_reader": "nerg_mi.tracking.readers.registry",
     "register_recipe": "nerg_mi.train.gaze_recipes",
-    "render": "nerg_mi.api.render",
-    "render_film": "nerg_mi.api.analysis",
-    "report": "nerg_mi.api.analysis",
-    "split_rays": "nerg_mi.api.recordings",
-    "statistics": "nerg_mi.api.analysis",
-    "study": "nerg_mi.api.evaluation",
-    "trace": "nerg_mi.api.query",
-    "train_gaze": "nerg_mi.api.training",
-    "train_prior": "nerg_mi.api.training",
-    "train_radiance": "nerg_mi.api.training",
+    "render": "nerg_mi.figures.pictures",
+    "render_film": "nerg_mi.figures.films",
+    "report": "nerg_mi.reports.report",
+    "split_rays": "nerg_mi.tracking.splits",
+    "statistics": "nerg_mi.aoi.statistics",
+    "study": "nerg_mi.evaluation.study_run",
+    "trace": "nerg_mi.environment.queries",
+    "train_gaze": "nerg_mi.train.gaze",
+    "train_prior": "nerg_mi.train.prior",
+    "train_radiance": "nerg_mi.train.radiance",
     "view": "nerg_mi.viewer.serve",
-    "write_scene": "nerg_mi.api.analysis",
+    "write_scene": "nerg_mi.environment.scene_file",
 }
 """The public names, and the module that defines each."""
 
 __all__ = [
+    "Alignment",
+    "Areas",
     "Camera",
     "DensityGrid",
+    "Environment",
+    "GazeField",
     "NergError",
+    "Photos",
+    "RadianceField",
     "Rays",
     "Scene",
     "align",
@@ -121,11 +168,18 @@ __all__ = [
     "bake",
     "check_rays",
     "compile_field",
-    "draw",
+    "draw_difference",
+    "draw_floor",
+    "draw_scanpath",
+    "draw_sheet",
+    "draw_sphere",
+    "draw_surface",
+    "draw_triptych",
     "evaluate_gaze",
     "evaluate_radiance",
     "export_mesh",
     "export_points",
+    "export_rays",
     "export_scene",
     "export_splats",
     "export_torch_ngp",
@@ -138,8 +192,10 @@ __all__ = [
     "import_rays",
     "load_field",
     "load_gaze",
+    "load_photos",
     "load_rays",
     "make_scene",
+    "measure_events",
     "next_look",
     "observe",
     "plot_rays",

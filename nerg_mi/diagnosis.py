@@ -13,9 +13,10 @@ import subprocess
 import sys
 from dataclasses import dataclass, field
 
+from nerg_mi.errors import format_error
+from nerg_mi.memory import MITSUBA_MEGABYTES, NUMPY_MEGABYTES, find_free_address_space
+
 from . import __version__, llvm
-from .errors import format_error
-from .memory import MITSUBA_MEGABYTES, NUMPY_MEGABYTES, find_free_address_space
 
 EXTRAS = {
     "torch": 'for torch-ngp checkpoints and fields as torch modules: pip install "nerg-mi[torch]"',

@@ -17,7 +17,7 @@ import re
 import sys
 from typing import NamedTuple
 
-from .errors import UnusableLLVM
+from nerg_mi.errors import UnusableLLVM
 
 MIN_VERSION = 17
 """Oldest major version of LLVM whose code generator supports all operations that Dr.Jit emits."""

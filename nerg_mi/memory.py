@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 
-from .errors import NergError
+from nerg_mi.errors import NergError
 
 NUMPY_MEGABYTES, SCIPY_MEGABYTES, MITSUBA_MEGABYTES = 140, 160, 400  # address space with two threads, measured
 

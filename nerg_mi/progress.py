@@ -11,8 +11,8 @@ from contextlib import contextmanager
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, runtime_checkable
 
-from .errors import NergError, Spelling, clean_text, parameter, spell_python
-from .files.html import element, markup
+from nerg_mi.errors import NergError, Spelling, clean_text, parameter, spell_python
+from nerg_mi.files.html import element, markup
 
 if TYPE_CHECKING:
     import rich.progress

@@ -8,8 +8,8 @@ from typing import Any, cast
 
 import numpy as np
 
-from .errors import NergError, sanitize
-from .ranges import MAX_COORDINATE, POSITIVE_VALUES, Range, check_number
+from nerg_mi.errors import NergError, sanitize
+from nerg_mi.ranges import MAX_COORDINATE, POSITIVE_VALUES, Range, check_number
 
 
 def read_number(props, name: str, default: float, allowed: Range) -> float:

@@ -8,13 +8,13 @@ import functools
 import inspect
 import math
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from numbers import Integral, Real
 from types import SimpleNamespace
 from typing import Any, TypeVar, cast, get_args, get_type_hints
 
-from .errors import NergError, parameter, sanitize
+from nerg_mi.errors import NergError, parameter, sanitize
 
 RANGE, FLAG = "nerg_mi.range", "nerg_mi.flag"
 """Keys in the metadata of a dataclass field: the `Range` of its value, and its spelling on the command line. An empty
@@ -135,7 +135,7 @@ def range_field(default: Any, allowed: Range) -> Any:
     return dataclasses.field(default=default, metadata={RANGE: allowed})
 
 
-def setting(default: Any, help: str, allowed: Range | None = None) -> Any:
+def setting(default: Any, help: str, allowed: Range | None = None, *, changes_result: bool = True) -> Any:
     """Declare a field of a settings dataclass (a `ValidatedDataclass`) that is also a command-line option.
 
     Parameters
@@ -146,16 +146,42 @@ def setting(default: Any, help: str, allowed: Range | None = None) -> Any:
         One-line description of the value.
     allowed
         Range of the number.
+    changes_result
+        False for a setting that affects where or how a result is computed, but not the result (`CHANGES_RESULT`).
     """
-    return dataclasses.field(default=default, metadata={RANGE: allowed, "help": help})
+    metadata = {RANGE: allowed, "help": help, CHANGES_RESULT: changes_result}
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+def check_text(value: Any, annotation: Any, name: str) -> None:
+    """Raise `NergError`, which calls the value ``name``, unless it is text if ``annotation`` is that of text, several
+    texts (or numbers of participants), a sequence if it is that of one, and a mapping of texts if it is that of one,
+    whose texts may be given as numbers."""
+    is_sequence = isinstance(value, Iterable) and not isinstance(value, (str, bytes))
+    if annotation in ("str", "str | None"):
+        if not isinstance(value, str) and (value is not None or annotation == "str"):
+            raise NergError(f"{name} must be text, got {sanitize(repr(value), 60)}; pass a string")
+    elif annotation == "Sequence[str]" or annotation == "tuple[str, ...]":
+        is_text = annotation == "Sequence[str]" or (
+            isinstance(value, (list, tuple)) and all(isinstance(text, str) for text in value)
+        )
+        if not (is_sequence and is_text):
+            raise NergError(f"{name} must be texts, got {sanitize(repr(value), 60)}; pass a list of strings")
+    elif "Annotated[Sequence[" in str(annotation) and value is not None and not is_sequence:
+        raise NergError(f"{name} must be numbers, got {sanitize(repr(value), 60)}; pass a list of numbers")
+    elif str(annotation).startswith("Mapping[str, str") and value is not None:
+        kinds = (str, Real) if "Mapping[str, str]" in annotation else object
+        items = value.items() if isinstance(value, Mapping) else [(None, None)]
+        if not all(isinstance(key, str) and isinstance(text, kinds) for key, text in items):
+            raise NergError(f"{name} must map names to values, got {sanitize(repr(value), 60)}; pass a dict")
 
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def check_ranges(function: Function) -> Function:
-    """Decorator: check annotated parameters, as ``Annotated[float, LENGTHS]`` or ``Literal[...]``, before ``function``
-    runs.
+    """Decorator: check annotated parameters, as ``Annotated[float, LENGTHS]``, ``Annotated[Sequence[float], LENGTHS]``
+    or ``Literal[...]``, before ``function`` runs.
 
     A concentration (`KAPPAS`) may be text with an angle (`parse_kappa`).
     """
@@ -164,16 +190,24 @@ def check_ranges(function: Function) -> Function:
 
     @functools.wraps(function)
     def call(*args: Any, **keywords: Any) -> Any:
-        bound = signature.bind(*args, **keywords)
+        try:
+            bound = signature.bind(*args, **keywords)
+        except TypeError as error:
+            # As Python says it where a function is called directly.
+            raise TypeError(f"{function.__qualname__}() {error}") from None
+        for name, value in bound.arguments.items():
+            check_text(value, function.__annotations__.get(name), parameter(name))
         for name, allowed in find_ranges(function).items():
             value = bound.arguments.get(name)
             if allowed is KAPPAS and isinstance(value, str):
                 bound.arguments[name] = parse_kappa(value, parameter(name))
             elif value is not None or (name in bound.arguments and "None" not in function.__annotations__[name]):
-                check_number(value, allowed, parameter(name), "[int," in function.__annotations__[name])
+                annotation = function.__annotations__[name]
+                for number in cast("Iterable[Any]", value) if "Sequence[" in annotation else (value,):
+                    check_number(number, allowed, parameter(name), "[int," in annotation)
         for name, allowed in choices.items():
             if (value := bound.arguments.get(name, allowed[0])) not in allowed:
-                names = " or ".join(f'"{choice}"' for choice in allowed)
+                names = " or ".join(f'"{choice}"' for choice in allowed if choice is not None)
                 raise NergError(f"{parameter(name)} must be {names}, got {sanitize(repr(value), 60)}")
         return function(*bound.args, **bound.kwargs)
 
@@ -194,17 +228,23 @@ def find_ranges(function: Callable[..., Any]) -> dict[str, Range]:
     return ranges
 
 
-def find_choices(function: Callable[..., Any]) -> dict[str, tuple[str, ...]]:
-    """Return the values of parameters of ``function`` that are annotated as ``Literal["a", "b"]``, by name."""
+def find_choices(function: Callable[..., Any]) -> dict[str, tuple[str | None, ...]]:
+    """Return the values of parameters of ``function`` that are annotated as ``Literal["a", "b"]`` or
+    ``Literal["a", "b"] | None``, by name."""
     annotations = {k: text for k, text in function.__annotations__.items() if str(text).startswith("Literal[")}
-    return {name: ast.literal_eval(f"{text.removeprefix('Literal')[1:-1]},") for name, text in annotations.items()}
+    lists = {
+        k: f"({text.removeprefix('Literal[').replace('] | None', ', None').rstrip(']')},)"
+        for k, text in annotations.items()
+    }
+    return {name: ast.literal_eval(text) for name, text in lists.items()}
 
 
 class ValidatedDataclass:
-    """Base class of dataclasses that validate their numbers on construction.
+    """Base class of dataclasses that validate their numbers and texts on construction.
 
-    A field with a `Range` in its metadata holds one number or several numbers in that range, or None if its type allows
-    None. Other values raise `NergError`. A concentration (`KAPPAS`) may be text with an angle (`parse_kappa`).
+    A field that is annotated as text, or as a tuple of texts, holds these. A field with a `Range` in its metadata holds
+    one number or several numbers in that range, or None if its type allows None. Other values raise `NergError`. A
+    concentration (`KAPPAS`) may be text with an angle (`parse_kappa`).
     """
 
     def __post_init__(self) -> None:
@@ -212,6 +252,7 @@ class ValidatedDataclass:
         for field in dataclasses.fields(self):
             allowed, annotation = field.metadata.get(RANGE), str(field.type)
             value: Any = getattr(self, field.name)
+            check_text(value, annotation, _describe_field(field))
             if allowed is KAPPAS and isinstance(value, str):
                 value = parse_kappa(value, _describe_field(field))
                 object.__setattr__(self, field.name, value)

@@ -16,9 +16,10 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+from nerg_mi.errors import NergError
+from nerg_mi.memory import MITSUBA_MEGABYTES, require_address_space
+
 from . import llvm
-from .errors import NergError
-from .memory import MITSUBA_MEGABYTES, require_address_space
 
 PLUGINS = (
     ("panorama", "sensor"),

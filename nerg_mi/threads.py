@@ -25,6 +25,20 @@ def set_thread_count(count: int) -> None:
         dr.set_thread_count(count)
 
 
+def lower_priority() -> None:
+    """Lower the priority of this thread and its children, where the operating system supports it.
+
+    A browser that draws on this machine, without a graphics card, would freeze while pictures are refined.
+    """
+    if hasattr(os, "nice"):
+        os.nice(10)
+
+
+def count_cpus() -> int:
+    """Return the number of CPUs that this process may use, as ``taskset`` and batch systems limit them."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def measure_processor_time() -> tuple[float, float] | None:
     """Return the seconds that all threads of this process ran, and that they were ready but waited for a processor.
 

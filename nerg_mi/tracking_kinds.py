@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 TRACKING_NOTES = {"head": "directions of heads", "mixed": "partly directions of heads"}
-"""What rays that are not all gaze are, by the kind of their tracking (`nerg_mi.rays.rays.TRACKING`)."""
+"""What rays that are not all gaze are, by the kind of their tracking (`nerg_mi.tracking.rays.TRACKING`)."""
 
 
 def read_tracking(provenance: Mapping[str, Any]) -> str:

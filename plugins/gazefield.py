@@ -46,8 +46,8 @@ Gaze field (:monosp:`gazefield`)
 How much surfaces attract an observer: equation 1 of the paper, :math:`G(p_{od}, p_o) = F_e(p_{od}, -r_o) \cdot
 \mathrm{sigmoid}(F_c(p_o, r_o))`, a density in 1/sr over the directions around the observer. It is the ``gaze`` of the
 integrator :ref:`nerg <integrator-nerg>`; since it depends on two positions, it cannot be evaluated as a plain volume. A
-field that was trained on the features of a radiance field (``nerg train gaze --semantic``) needs that radiance field as
-the integrator's ``field``.
+field that was trained on the features of a radiance field (option ``semantic`` of a recipe) needs that radiance field
+as the integrator's ``field``.
 
 For an ensemble (``nerg train gaze --ensemble``) gaze is the mean of the members, each normalised separately if it is
 normalised; the AOV ``gaze_std`` of the integrator shows their standard deviation. The checkpoint also stores the number
@@ -78,7 +78,7 @@ from copy import copy
 import mitsuba as mi
 
 from nerg_mi.errors import NergError
-from nerg_mi.fields.gaze_base import AnyGazeField, kinds
+from nerg_mi.fields.gaze_base import GazeNetwork, kinds
 from nerg_mi.fields.mlp import namespace, set_constant_weights
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.maths.geometry import Similarity
@@ -104,7 +104,7 @@ class GazeFieldVolume(make_volume_class()):
             set_constant_weights(self.field)
 
     @staticmethod
-    def check(network: AnyGazeField) -> None:
+    def check(network: GazeNetwork) -> None:
         if getattr(network, "kind", None) not in kinds():
             raise NergError(
                 f"expected a gaze field in memory, got {type(network).__name__}; load it from its file first"

@@ -57,11 +57,11 @@ import mitsuba as mi
 
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.maths.geometry import Similarity
-from nerg_mi.probes.kde_view import KdeView
 from nerg_mi.properties import read_integer, read_number, read_string, read_transform, resolve_scene_file
 from nerg_mi.ranges import Range
-from nerg_mi.rays.rays import Rays
 from nerg_mi.registration import register
+from nerg_mi.tracking.kde_view import KdeView
+from nerg_mi.tracking.rays import Rays
 
 
 class GazeKdeVolume(mi.Volume):

@@ -72,7 +72,7 @@ import mitsuba as mi
 
 from nerg_mi.errors import NergError
 from nerg_mi.fields.mlp import namespace, set_constant_weights
-from nerg_mi.fields.radiance import RadianceField
+from nerg_mi.fields.radiance import RadianceNetwork
 from nerg_mi.formats.fields import load_radiance
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.properties import load_network, make_volume_class, read_boolean, read_number, read_transform
@@ -99,8 +99,8 @@ class NerfVolume(make_volume_class()):
             set_constant_weights(field)
 
     @staticmethod
-    def check(network: RadianceField) -> None:
-        if not isinstance(network, RadianceField):
+    def check(network: RadianceNetwork) -> None:
+        if not isinstance(network, RadianceNetwork):
             raise NergError(
                 f"expected a radiance field in memory, got {type(network).__name__}; load it from its file first"
             )

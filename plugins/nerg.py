@@ -141,7 +141,7 @@ Neural radiance and gaze fields (:monosp:`nerg`)
    - |bool|
    - Shift the steps of each sample by a random fraction of a step, which replaces banding by noise. (Default: false)
 
-docs/explanation/error-and-time.md ("Defaults") measures the benefit and the cost of each default.
+docs/explanation/error-and-time.md measures what each default contributes.
 
 This integrator marches through a radiance field, or any pair of volumes, and evaluates a gaze field on the surface that
 each ray meets: :math:`G(p_{od}, p_o) = F_e(p_{od}, -r_o)\,\mathrm{sigmoid}(F_c(p_o, r_o))` (equation 1 of the paper),

@@ -169,7 +169,7 @@ class CameraView:
 
     def compute_channels(self, aovs: Sequence[str]) -> list[Float]:
         """All channels of AOVs that do not depend on the observer."""
-        return nerg_aovs.compute_channels(aovs, self.make_pixel())
+        return self.make_pixel().compute_channels(aovs)
 
     def eval_shared(self, *extra: Any) -> None:
         """Evaluate the values that observers share, and ``extra`` ones, so that kernels of observers start from
@@ -272,8 +272,11 @@ class Pixel:
         self._evaluations: Float = arrays.Float(0)
 
     def compute_channels(self, aovs: Sequence[str]) -> list[Float]:
-        """All channels of AOVs."""
-        return nerg_aovs.compute_channels(aovs, self)
+        """All channels of AOVs, in order."""
+        # Evaluation counts come last, when all other AOVs have been computed.
+        order = sorted((nerg_aovs.AOVS[name] for name in aovs), key=lambda aov: "counts" in aov.required_data)
+        channels = {aov.name: aov.compute(self if aov.is_per_observer else self.camera) for aov in order}
+        return [channel for name in aovs for channel in channels[name]]
 
     @cached_property
     def observer(self) -> ObserverContext:
@@ -368,7 +371,7 @@ class Pixel:
             )
             return SurfaceGaze(occlude(density), dr.select(unknown, networks, 0))
         needed = surface if "factors" in self.context.required_data else visible
-        density, emit, capture, *spread = self._evaluated(needed)
+        density, emit, capture, *spread = self._evaluate_gaze(needed)
         return SurfaceGaze(
             occlude(density),
             dr.select(needed, networks, 0),
@@ -377,7 +380,7 @@ class Pixel:
             occlude(spread[0]) if spread else None,
         )
 
-    def _evaluated(self, needed: Bool) -> tuple:
+    def _evaluate_gaze(self, needed: Bool) -> tuple:
         """``(gaze, emit, capture)``, and the standard deviation if required, on the lanes ``needed``."""
         gaze, p_od, p_o, r_o = self.gaze, self.observer_hit.p_od, self.observer.p_o, self.r_o
         with_spread = "spread" in self.context.required_data

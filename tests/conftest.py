@@ -63,6 +63,21 @@ def _restore_thread_count(rgb):
     set_thread_count(before)
 
 
+@pytest.fixture(autouse=True, scope="session")
+def _keep_priority():
+    """Ignore `nerg view`, which lowers the priority of its process: all later tests would run with it."""
+    with pytest.MonkeyPatch.context() as change:
+        change.setattr(os, "nice", lambda increment: 0, raising=False)
+        yield
+
+
+@pytest.fixture
+def equal_processes():
+    """Skip a test that compares bits with workers of a cluster, which `make portable` does not limit."""
+    if os.environ.get(other_processor.VARIABLE):
+        pytest.skip("workers compute as this processor, and the test as another one")
+
+
 @pytest.fixture
 def one_thread():
     """Use one thread, so that sums have a fixed order and equal runs are equal bit for bit."""
@@ -231,8 +246,7 @@ def trained(tmp_path_factory):
 
     import mitsuba as mi
 
-    from nerg_mi.workflows.gaze_commands import GazeOptions
-    from nerg_mi.workflows.train_gaze import train_gaze
+    from nerg_mi.train.gaze import train_gaze
     from tests.evaluation.test_gaze import crowd
 
     mi.set_variant("llvm_ad_rgb")
@@ -247,8 +261,8 @@ def trained(tmp_path_factory):
         "min_rays": 8,
         "voxel_size": 0.3,
     }
-    options = GazeOptions(geometry="hits", test_zones=1, test_positions=3, **small)
-    train_gaze(folder / "rays.npz", folder / "gaze.safetensors", options)
+    output = folder / "gaze.safetensors"
+    train_gaze(folder / "rays.npz", "hits", test_zones=1, test_positions=3, **small, output=output)
     return folder
 
 
@@ -259,14 +273,14 @@ def cube(tmp_path):
     import mitsuba as mi
 
     from nerg_mi.fields.encoding import HashGridConfig
-    from nerg_mi.fields.radiance import RadianceConfig, RadianceField
+    from nerg_mi.fields.radiance import RadianceConfig, RadianceNetwork
     from nerg_mi.formats.fields import save_radiance
     from nerg_mi.maths.geometry import Box
 
     mi.set_variant("llvm_ad_rgb")
     grid = HashGridConfig(levels=2, log2_rows=8, base=4, finest=8)
     config = RadianceConfig(grid=grid, width=16, color_hidden=1, density_scale=50.0)
-    field = RadianceField.random(config, Box((-1, -1, -1), (1, 1, 1)), ns, 0, march_step=0.05)
+    field = RadianceNetwork.random(config, Box((-1, -1, -1), (1, 1, 1)), ns, 0, march_step=0.05)
     field.set_parameters({k: type(v)(np.zeros(v.shape, np.float32)) for k, v in field.parameters().items()})
     frames = []
     for k in range(3):

@@ -17,14 +17,13 @@ import typer
 import nerg_mi as nerg
 import nerg_mi.cli
 from nerg_mi.cli.building import find_commands
-from nerg_mi.evaluation import study as study_settings
-from nerg_mi.evaluation.study_subject import VOXEL_RESOLUTIONS
+from nerg_mi.tracking.readers.base import FROM_RECORDINGS
+from nerg_mi.tracking.readers.registry import iterate_readers, list_reader_names
 from nerg_mi.transport.march_primal import MarchSettings
 from tests.conftest import ROOT
-from tests.evaluation.subjects import make_subject
-from tools import command_pages, generated
+from tools import command_pages, generated, reference
 
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PAGES = generated.pages()
 OF_DASK = {"--dashboard-address", "--no-dashboard", "--protocol", "--tls-ca-file", "--tls-cert", "--tls-key"}
 FOREIGN = {"--tcnn", "--ff", "--hook-type", "--python"} | OF_DASK  # of torch-ngp, pre-commit, Blender and dask
 NUMBERS = "zero one two three four five six seven eight nine ten".split()
@@ -60,7 +59,7 @@ def test03_defaults_of_the_march_are_the_integrators(rgb):
 
 def test06_tests_that_are_named_exist():
     named = {m for page in PAGES for m in re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", page.read_text(encoding="utf-8"))}
-    assert len(named) > 20
+    assert named
     missing = [
         f"{file}::{name}"
         for file, name in sorted(named)
@@ -96,28 +95,33 @@ def test07_commands_are_found():
     ]
 
 
+def check_command(program: str, *words: str) -> None:
+    """Parse a command of nerg; look up the options of a script."""
+    if program == "nerg" and words[0].startswith("-"):  # an option such as --version, which is not run here
+        assert len(words) == 1 and words[0] in options(), words
+        return
+    if program == "nerg":
+        command = typer.main.get_command(nerg_mi.cli.build_app())
+        context = command.make_context("nerg", list(words))
+        while hasattr(command, "commands"):
+            name, command, words = command.resolve_command(context, list(words))
+            context = command.make_context(name, list(words), parent=context)
+        return
+    module = words[0] == "-m"
+    script = words[1].removeprefix("nerg_mi.").replace(".", "/") + ".py" if module else words[0]
+    text = (ROOT / script).read_text(encoding="utf-8")
+    # Options that several scripts share are defined in a module next to them.
+    for sibling in re.findall(r"^from (\w+) import .*_parser\b", text, re.M):
+        text += (ROOT / script).with_name(f"{sibling}.py").read_text(encoding="utf-8")
+    valid = re.findall(r'"(--[a-z][a-z0-9-]*)"', text)
+    flags = [word.strip("[") for word in words if word.strip("[").startswith("--")]
+    assert set(flags) <= set(valid), (script, flags)
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
 def test08_commands_are_right_as_they_stand(page):
-    for program, *words in commands(page.read_text(encoding="utf-8")):
-        if program == "nerg" and words[0].startswith("-"):  # an option such as --version, which is not run here
-            assert len(words) == 1 and words[0] in options(), words
-            continue
-        if program == "nerg":
-            command = typer.main.get_command(nerg_mi.cli.build_app())
-            context = command.make_context("nerg", list(words))
-            while hasattr(command, "commands"):
-                name, command, words = command.resolve_command(context, list(words))
-                context = command.make_context(name, list(words), parent=context)
-            continue
-        module = words[0] == "-m"
-        script = words[1].removeprefix("nerg_mi.").replace(".", "/") + ".py" if module else words[0]
-        text = (ROOT / script).read_text(encoding="utf-8")
-        # Options that several scripts share are defined in a module next to them.
-        for sibling in re.findall(r"^from (\w+) import .*_parser\b", text, re.M):
-            text += (ROOT / script).with_name(f"{sibling}.py").read_text(encoding="utf-8")
-        valid = re.findall(r'"(--[a-z][a-z0-9-]*)"', text)
-        flags = [word.strip("[") for word in words if word.strip("[").startswith("--")]
-        assert set(flags) <= set(valid), (script, flags)
+    for words in commands(page.read_text(encoding="utf-8")):
+        check_command(*words)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
@@ -136,23 +140,18 @@ def test10_the_architecture_lists_all_packages():
     assert named == {path.parent.name for path in (ROOT / "nerg_mi").glob("*/__init__.py")}
 
 
-def test10_settings_of_the_study_are_the_studys():
-    subject = make_subject(1.0, is_normalized=True, voxel_resolutions=VOXEL_RESOLUTIONS)
-    names = {setting.name for setting in study_settings.list_rows(subject)}
-    listed = set()
-    for table in re.findall(
-        r"^\| setting .*\n\|.*\n((?:\|.*\n)+)", (ROOT / "docs/explanation/error-and-time.md").read_text(), re.M
-    ):
-        listed |= {line.split("|")[1].strip() for line in table.splitlines()}
-    assert len(listed) > 50 and listed <= names
-
-
 # ---- The README and the pages at the root ----
 
 
 def test11_commands_of_the_readme_exist():
     said = set(re.findall(r"^\| `nerg (\w+)", (ROOT / "README.md").read_text("utf-8"), re.M))
     assert said and said <= {name.split()[0] for name in find_commands()}
+
+
+def test_the_readme_counts_the_readers():
+    text = " ".join((ROOT / "README.md").read_text(encoding="utf-8").split())
+    tested = [reader for reader in iterate_readers() if reader.evidence.startswith(FROM_RECORDINGS)]
+    assert f"Of {len(list_reader_names())} readers, {NUMBERS[len(tested)]} were tested on real recordings" in text
 
 
 @pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md", "CHANGELOG.md"])
@@ -193,27 +192,18 @@ def test_types_come_with_the_package():
 # ---- Public names ----
 
 
-REFERENCE = (ROOT / "docs" / "reference" / "python.md").read_text(encoding="utf-8")
+PUBLIC = [getattr(nerg, name) for name in nerg.__all__]
+LISTED = re.findall(r"^\.\. auto(?:function|class|exception):: (\S+)", reference.python(), re.M)
 
 
-def test20_names_of_the_page_on_python_are_those_of_the_package():
-    assert set(re.findall(r"\bnerg\.(?!py\b)(\w+)", REFERENCE)) <= set(nerg.__all__)
-
-
-LISTED = re.findall(r"^\.\. auto(?:function|class|exception):: (\S+)", REFERENCE, re.M)
+def test_names_of_the_page_on_python_are_those_of_the_package():
+    page = (ROOT / "docs" / "how-to" / "python.md").read_text(encoding="utf-8")
+    assert set(re.findall(r"\bnerg\.(?!py\b)(\w+)", page)) <= set(nerg.__all__)
 
 
 def named(path: str) -> object:
     module, _, name = path.rpartition(".")
-    return getattr(import_module(module), name) if module else getattr(nerg, path)
-
-
-def test21_every_public_name_is_listed_once():
-    assert sorted(path.rpartition(".")[2] for path in LISTED if named(path) in PUBLIC) == sorted(nerg.__all__)
-    assert len(set(LISTED)) == len(LISTED)
-
-
-PUBLIC = [getattr(nerg, name) for name in nerg.__all__]
+    return getattr(import_module(module), name)
 
 
 @pytest.mark.parametrize("path", LISTED)
@@ -226,14 +216,26 @@ def test22_what_is_public_is_documented(path):
                 assert inspect.getdoc(member), f"{path}.{name} has no docstring"
 
 
-def test23_what_functions_give_is_listed():
-    """The classes of results, from the annotations of functions that return them."""
-    returned = set()
-    for function in filter(inspect.isfunction, PUBLIC):
-        returned |= set(re.findall(r"\b[A-Z]\w+", str(inspect.signature(function).return_annotation)))
-    names = {path.rpartition(".")[2] for path in LISTED}
-    # The networks within a TrainedField, a figure of matplotlib, and a path.
-    assert returned - names <= {"RadianceField", "AnyGazeField", "Figure", "Path", "None"}
+def test_what_functions_take_and_return_is_listed():
+    assert len(set(LISTED)) == len(LISTED) and {f"nerg_mi.{name}" for name in nerg.__all__} <= set(LISTED)
+    others = {"figures.pictures.Pictures", "tracking.splits.RaysSplit", "transport.quadrature.QuadratureRule"}
+    assert {f"nerg_mi.{name}" for name in others} <= set(LISTED)
+
+
+# ---- The reference ----
+
+
+def test_the_reference_has_every_command_plugin_and_reader(tmp_path):
+    reference.write_pages(tmp_path)
+    pages = {page.stem: page.read_text(encoding="utf-8") for page in tmp_path.iterdir()}
+    assert set(pages) == set(reference.PAGES)
+    titles = {name: re.findall(r"^## (.+)", text, re.M) for name, text in pages.items()}
+    assert {f"nerg {name}" for name in find_commands()} <= set(titles["commands"])
+    assert len(titles["plugins"]) == len(reference.PLUGINS)
+    assert set(re.findall(r"^- `(\w+)`: .*", pages["recordings"], re.M)) >= set(list_reader_names())
+    for target in reference.find_sections().values():
+        page, _, anchor = target.partition("#")
+        assert not anchor or anchor in map(reference.anchor, titles[page.removesuffix(".md")]), target
 
 
 # ---- Generated parts of pages ----

@@ -40,19 +40,7 @@ def test_texts_are_spelled_for_python_unless_told_otherwise():
 
 # ---- Messages of the package ----
 
-DECLARING = {
-    "option",
-    "argument",
-    "extra",
-    "out",
-    "setting",
-    "coordinates",
-    "command",
-    "declare",
-    "_vmax",
-    "check",
-    "HelpView",
-}
+DECLARING = {"option", "argument", "extra", "out", "setting", "command", "check", "HelpView"}
 """Functions whose texts are help of the command line, or of its manual."""
 
 COMMAND = re.compile(r"`[^`]*`|\b(nerg [a-z]|python3? -m |pip install )[^;()\"]*")

@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 
-from examples import place_product
+from examples import aria_room, place_product
 from examples import recover_observer as example
 from tests.conftest import ROOT
 
@@ -49,6 +49,16 @@ def test03_gradient_ascent():
 def test04_unknown_shelf_is_reported(rgb):
     with pytest.raises(SystemExit, match='no shelf "attic".*wall_cosmetics'):
         place_product.Shelf("attic")
+
+
+# ---- Gaze in a real room ----
+
+
+@pytest.mark.nightly
+def test_gaze_of_glasses_ends_on_the_points_of_the_room(recorded, rgb, tmp_path):
+    out = tmp_path / "room.png"
+    share = aria_room.main([str(recorded("aria") / "gen1" / "mps_sample"), "--out", str(out), "--width", "96"])
+    assert 0.7 < share < 0.9 and out.stat().st_size > 5000  # points have holes
 
 
 # ---- Recovering an observer ----

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import importlib.metadata
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -88,7 +89,7 @@ def test01_an_editable_installation_is_found_next_to_a_clone_of_that_name(tmp_pa
         begin + "import nerg_mi; print(nerg_mi.render.__module__)" + textwrap.dedent(USE), clone.parent
     )
     assert done.returncode == 0, done.stderr
-    assert "nerg_mi.api.render" in done.stdout
+    assert "nerg_mi.figures.pictures" in done.stdout
     assert done.stdout.split()[-2:] == [str(clone / "plugins/nerg.py"), str(clone / "scenes/store/layout.py")]
 
 
@@ -493,3 +494,23 @@ def test_all_packages_are_installed():
     listed = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
     folders = {".".join(path.parent.relative_to(ROOT).parts) for path in (ROOT / "nerg_mi").rglob("__init__.py")}
     assert [name for name in sorted(folders) if f'"{name}",' not in listed] == []
+
+
+OF_EXTRAS = {"c3d", "dask", "distributed", "pyarrow", "pycolmap", "torch", "viser", "websockets", "xarray"}
+"""Libraries whose absence is named where they are imported."""
+
+
+def test_libraries_of_the_core_are_dependencies():
+    """Such as narwhals, which reads the data frames of `Rays.from_dataframe`."""
+    statement = re.compile(
+        r"^ *(?:from (\w+)[.\w]* import|import ([a-zA-Z]\w*)[.\w]*(?: as \w+)?(?:  #.*)?$)", re.MULTILINE
+    )
+    imported = set()
+    for path in (path for name in ("nerg_mi", "plugins", "scenes") for path in (ROOT / name).rglob("*.py")):
+        imported |= {a or b for a, b in statement.findall(path.read_text(encoding="utf-8"))}
+    typing_only, in_prose = {"_typeshed", "typing_extensions"}, {"Mitsuba"}
+    libraries = imported - set(sys.stdlib_module_names) - OF_EXTRAS - typing_only - in_prose - {"nerg_mi"}
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    listed = re.findall(r'^    "([\w-]+)', text[text.index("\ndependencies = ") : text.index("\n]\n")], re.MULTILINE)
+    distributions = {"PIL": "pillow", "Imath": "OpenEXR"}
+    assert {distributions.get(name, name) for name in libraries} == set(listed)

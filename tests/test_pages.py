@@ -14,28 +14,30 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from nerg_mi.scenes.store import SCENE_FILE
 
 import nerg_mi.cli
-from nerg_mi.aoi.scene import read_changes
-from nerg_mi.formats.areas import read_areas
+from nerg_mi.aoi.areas import Areas
+from nerg_mi.aoi.changes import read_changes
+from nerg_mi.aoi.settings import AoiSampling
+from nerg_mi.cli import demo
 from nerg_mi.maths.sphere import sample_uniform_directions
-from nerg_mi.rays.rays import Rays
-from nerg_mi.workflows import demo
+from nerg_mi.tracking.rays import Rays
 from tests.conftest import ROOT
 from tests.figures.standins import write_standins
-from tests.workflows.test_draw import walk
-from tests.workflows.watched import write_scene
+from tests.figures.test_floor_plans import make_walk
+from tests.watched import write_scene
+from tools import generated, reference
 
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PAGES = {page.name: page.read_text(encoding="utf-8") for page in generated.pages()}
+PAGES["plugins.md"] = reference.plugins()
 
 NOT_RUN = {
-    ("accuracy.md", "text"): "a formula",
-    ("commands.md", "text"): "a formula",
+    ("numerics.md", "text"): "a formula",
     ("baking.md", "text"): "what a command prints",
     ("bids.md", "text"): "files of a dataset",
     ("events.md", "text"): "a table that a command reads",
     ("plugins.md", "math"): "a formula",
-    ("python.md", "{eval-rst}"): "what Sphinx is told; `make manual` builds the page",
     ("quickstart.md", "text"): "what commands print",
 }
 """All blocks of a language on a page -> why nothing is there to be run."""
@@ -81,10 +83,10 @@ def run(text: str, page: str, names: dict | None = None) -> dict:
 def blocks(*languages: str, page: str = "") -> list[Block]:
     """The code blocks of one page or all pages, in some languages or all."""
     matches = []
-    for path in PAGES:
-        for _, language, text in re.findall(r"^( *)```([^\n`]*)\n(.*?)^ *```", path.read_text("utf-8"), re.M | re.S):
-            if (not languages or language in languages) and page in ("", path.name):
-                matches.append(Block(path.name, language, text))
+    for name, content in PAGES.items():
+        for _, language, text in re.findall(r"^( *)```([^\n`]*)\n(.*?)^ *```", content, re.M | re.S):
+            if (not languages or language in languages) and page in ("", name):
+                matches.append(Block(name, language, text))
     return matches
 
 
@@ -92,7 +94,8 @@ def test01_no_block_is_left_out():
     here = {"sh", ("README.md", "python"), ("figures.md", "py"), ("python.md", "py"), ("exchange.md", "py")}
     here |= {(f"{page}.md", "json") for page in ("viewer", "store", "statistics")}
     here |= {
-        (f"{page}.md", "python") for page in "derivatives evaluation exchange python store recordings next-look".split()
+        (f"{page}.md", "python")
+        for page in "derivatives evaluation exchange python store recordings next-look training CONTRIBUTING".split()
     }
     here |= {(b.page, b.language) for b in blocks("xml", "python") if b.page in ("plugins.md", *XML_PAGES)}
     for block in blocks():
@@ -118,14 +121,13 @@ def test03_every_line_of_a_shell_is_known():
 
 
 def test04_areas_are_read(tmp_path):
-    from nerg_mi.formats.areas import read_regions
 
     for block in blocks("json", page="viewer.md"):
         (tmp_path / "a.json").write_text(block.text)
-        assert all(region.contains(region.corners).all() for region in read_regions(tmp_path / "a.json"))
+        assert all(region.contains(region.corners).all() for region in Areas.load(tmp_path / "a.json").boxes)
 
 
-XML_PAGES = ("figures.md", "performance.md", "plugins.md", "environments.md")
+XML_PAGES = ("figures.md", "plugins.md", "environments.md")
 
 
 @pytest.fixture
@@ -136,7 +138,7 @@ def place(rgb, standins, tmp_path, monkeypatch):
 
     for file in standins.values():
         shutil.copy(file, tmp_path)
-    shutil.copy(demo.find_store_scene(), tmp_path)
+    shutil.copy(SCENE_FILE, tmp_path)
     shutil.copy(tmp_path / "store.safetensors", tmp_path / "field.safetensors")
     crowd().save(tmp_path / "day.npz")
     write_inria(tmp_path / "store.ply", random_splats())
@@ -200,7 +202,7 @@ def test_scenes_are_exported(rgb, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     room = trimesh.creation.box((8, 6, 3)).apply_translation((4, 3, 1.5))
     room.export("day.ply")
-    gaze = nerg.load_gaze(demo.find_store_scene().parent / "shoppers.safetensors")
+    gaze = nerg.load_gaze(SCENE_FILE.parent / "shoppers.safetensors")
     names = {"nerg": nerg, "room": room, "gaze": gaze, "camera": nerg.Camera((1, 1, 2), (5, 4, 1), width=12, height=8)}
     names["rays"] = nerg.Rays.from_arrays([[4, 3, 1.6]] * 9, [[1, 0, 0]] * 9, times=np.arange(9) / 30)
     (block,) = blocks("py", page="exchange.md")
@@ -210,7 +212,7 @@ def test_scenes_are_exported(rgb, tmp_path, monkeypatch):
 
 def test08_datasets(tmp_path, monkeypatch):
     pytest.importorskip("pyarrow", reason="pyarrow is not installed")
-    from tests.rays.dataset.making import write_dataset
+    from tests.tracking.dataset.making import write_dataset
 
     monkeypatch.chdir(tmp_path)
     _, rays = write_dataset(tmp_path, place="north")
@@ -220,6 +222,14 @@ def test08_datasets(tmp_path, monkeypatch):
         run(text, block.page, names)
     assert len(names["some"]) == len(rays) == names["seen"].count_rows()
     assert len(names["rays"]) > 0 and set(np.array(names["rays"].persons)[names["rays"].person]) == {"p0_1"}
+
+
+def test_a_recipe_has_other_settings():
+    trained = {}
+    names = {"nerg": SimpleNamespace(train_gaze=lambda rays, *_, **options: trained.update(options)), "rays": None}
+    (block,) = blocks("python", page="training.md")
+    run(block.text, "training.md", names)
+    assert trained["recipe"].settings.loss == "code" and trained["recipe"].name == "small"
 
 
 def test_heads_are_turned_to_gaze(tmp_path, monkeypatch):
@@ -234,7 +244,7 @@ def test_heads_are_turned_to_gaze(tmp_path, monkeypatch):
     eyes = nerg.Rays(np.arange(400), np.zeros(400, int), ("a",), head * 0, below, np.ones(400), head=head)
     eyes.save("eyes.npz")
     trained = {}
-    names = {"nerg": SimpleNamespace(Rays=nerg.Rays, train_gaze=lambda rays, **options: trained.update(rays=rays))}
+    names = {"nerg": SimpleNamespace(Rays=nerg.Rays, train_gaze=lambda rays, *_, **options: trained.update(rays=rays))}
     (text,) = [block.text for block in blocks("python", page="next-look.md")]
     run(text, "next-look.md", names | {"rays": replace(eyes, direction=head)})
     assert trained["rays"].direction == pytest.approx(below, abs=1e-6)
@@ -251,13 +261,13 @@ def test09_from_recordings(rgb, place, monkeypatch):
     table = np.column_stack([rays.t, rays.origin, rays.direction])
     lines = [",".join(map(str, row)) + f",{who}" for row, who in zip(table, names)]
     Path("day.csv").write_text("t,x,y,z,dx,dy,dz,who\n" + "\n".join(lines) + "\n")
-    (text,) = [block.text for block in blocks("py", page="python.md")]
+    (text,) = [b.text for b in blocks("py", page="python.md") if "train_radiance" in b.text]
     fewer = {"minutes=5": "steps=30, holdout=0", "test_zones=3": FEW}
     for long, short in fewer.items():
         assert text.count(long) == 1
         text = text.replace(long, short)
     write_photos(place / "photos", nerg)
-    names = run(text, "docs/reference/python.md", {"nerg": nerg})
+    names = run(text, "docs/how-to/python.md", {"nerg": nerg})
     assert names["field"].kind == "radiance" and names["gaze"].kind == "gaze" and names["scores"].rows
 
 
@@ -291,7 +301,7 @@ def clone(rgb, tmp_path, monkeypatch):
         store = tmp_path / "scenes" / "store"
         store.mkdir(parents=True)
         for name in names:
-            shutil.copy(demo.find_store_scene().with_name(name), store)
+            shutil.copy(SCENE_FILE.with_name(name), store)
         monkeypatch.chdir(tmp_path)
         return store
 
@@ -310,7 +320,7 @@ def with_smaller_image(text: str) -> str:
 def readme(clone):
     """The scene and the checkpoints; random ones if the store has none."""
     block = list(demo.CHECKPOINTS.values())
-    has_own = all(demo.find_store_scene().with_name(name).is_file() for name in block)
+    has_own = all(SCENE_FILE.with_name(name).is_file() for name in block)
     store = clone("scene.xml", *(block if has_own else ()))
     if not has_own:
         write_standins(store)
@@ -333,6 +343,7 @@ def test11_the_python_of_the_readme(readme):
     assert names["share"].shape == (2,) and (names["share"] >= 0).all()
 
 
+@pytest.mark.nightly
 def test12_a_sign(clone, capsys):
     """For fewer visitors."""
     clone("twin.ply", "shoppers.safetensors")
@@ -375,18 +386,22 @@ def shoppers(people: int = 5, each: int = 60) -> Rays:
     return Rays(times, who, tuple("abcde"[:people]), origin, d, np.ones(n))
 
 
+@pytest.mark.nightly
 def test14_a_shop(rgb, tmp_path, monkeypatch):
     """The settings of the page, with fewer participants, positions and directions."""
     monkeypatch.chdir(tmp_path)
     for name in ("shapes.xml", "twin.ply", "twin_lights.ply", "shoppers.safetensors"):
-        shutil.copy(demo.find_store_scene().with_name(name), tmp_path)
+        shutil.copy(SCENE_FILE.with_name(name), tmp_path)
     for name, block in zip(("areas", "zones", "changes"), blocks("json", page="store.md")):
         (tmp_path / f"{name}.json").write_text(block.text)
     shoppers().save(tmp_path / "shop.npz")
     block = blocks("python", page="store.md")[0]
-    fewer = 'output="numbers", viewpoints=5, directions=512, resamples=199, aoi_samples=8'
-    names = run(block.text.replace('output="numbers"', fewer), block.page)
-    assert set(names["counted"]) == set(read_areas(tmp_path / "areas.json").names)
+    sampling = AoiSampling(directions=512, aoi_samples=8)
+    small = block.text.replace(
+        "    aoi_visibility", "    viewpoints=5, resamples=199, sampling=sampling, aoi_visibility"
+    )
+    names = run(small, block.page, {"sampling": sampling})
+    assert set(names["counted"]) == set(Areas.load(tmp_path / "areas.json").names)
     assert names["weakest"] in names["counted"] and "display" in {r["aoi"] for r in names["found"].what_if}
     assert (tmp_path / "numbers" / "aois.png").is_file()
 
@@ -395,7 +410,7 @@ def test15_files_of_statistics(tmp_path):
     areas, changes = (block.text for block in blocks("json", page="statistics.md"))
     (tmp_path / "a.json").write_text(areas)
     (tmp_path / "c.json").write_text(changes)
-    assert len(read_areas(tmp_path / "a.json").areas) == len(json.loads(areas)["regions"])
+    assert len(Areas.load(tmp_path / "a.json").areas) == len(json.loads(areas)["regions"])
     names = read_changes(tmp_path / "c.json")
     assert names.move and names.remove and names.add and names.swap and names.observers is not None
 
@@ -404,13 +419,13 @@ def test16_pictures(tmp_path, rgb, monkeypatch):
     import nerg_mi as nerg
 
     path = write_scene(tmp_path)
-    walk().save(tmp_path / "rays.npz")
+    make_walk().save(tmp_path / "rays.npz")
     shutil.copy(tmp_path / "gaze.safetensors", tmp_path / "shoppers.safetensors")
     monkeypatch.chdir(tmp_path)
     names = {"nerg": nerg, "scene": nerg.Scene.load(str(path))}
     for block in blocks("py", page="figures.md"):
         if "from PIL" in block.text:
-            nerg.draw("floor", "rays.npz", "gaze.png")
+            nerg.draw_floor("rays.npz", "gaze.png")
         smaller = block.text.replace("scenes/store/scene.xml", "scene.xml").replace("width=480", "width=64, spp=1")
         run(smaller, block.page, names)
     assert {"floor.svg", "gaze.pdf"} <= set(os.listdir("."))
@@ -423,11 +438,12 @@ def test_saliency_metrics_of_the_evaluation_page():
 
 
 def test17_clusters(capsys):
-    (block,) = [block for block in blocks("python", page="python.md") if "run_plan" in block.text]
+    (block,) = blocks("python", page="CONTRIBUTING.md")
     run(block.text, block.page, {"__name__": "page"})
     assert capsys.readouterr().out == ".txt 2.0\n"
 
 
+@pytest.mark.nightly
 def test18_python(rgb, tmp_path, monkeypatch):
     """Thirty lines lead from loading to a plot of attention shares; then fields are saved and evaluated."""
     import matplotlib
@@ -438,13 +454,14 @@ def test18_python(rgb, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     texts, names = [block.text for block in blocks("python", page="python.md")], {}
     assert len([line for line in texts[0].splitlines() if line.strip()]) <= 30
-    for text in texts[:5]:
-        small = text.replace("width=480, height=320", "width=24, height=16").replace("4.6, 10)", "4.6, 8)")
+    for text in texts:
+        small = text.replace("width=480, height=320", "width=24, height=16").replace("4.6, 10)", "4.6, 2)")
+        small = small.replace("[[2, 7]]", "[[0, 1]]")
         assert small.count("width=24") == text.count("width=480")
-        run(small.replace("spp=4", "spp=1"), "docs/reference/python.md", names)
+        run(small.replace("spp=4", "spp=1"), "docs/how-to/python.md", names)
         if text is texts[0]:
             share = np.array(list(names["share"].values()))
-            assert share.shape == (4, 8) and (share >= 0).all() and (share.sum(axis=0) < 1.1).all()
+            assert share.shape == (4, 2) and (share >= 0).all() and (share.sum(axis=0) < 1.1).all()
             # Participants who come nearer to the coolers look at them more.
             assert share.max() > 0.01 and share[3, -1] > share[3, 0]
             assert names["view"].gaze.shape == (2, 16, 24)
@@ -459,10 +476,9 @@ def test18_python(rgb, tmp_path, monkeypatch):
 
 SMALLER = {
     "nerg render": "--spp 1 -D width=24 -D height=16",
-    "nerg train": "--radius 0.6 --probes 8 --steps 2 --directions 64 --min-rays 8 --seed 1 --test-positions 4 --force",
+    "nerg train": "--radius 0.6 --steps 2 --min-rays 8 --seed 1 --test-positions 4 --force",
     "nerg eval": "--min-rays 4",
-    "nerg scene": "--width 36",
-    "nerg report": "--width 36 --spp 1 --max-points 500",
+    "nerg report": "--width 36",
     "nerg stats": "--viewpoints 8 --resamples 199",
 }
 """What is added to a command, so that it takes a second."""

@@ -64,10 +64,9 @@ def usual_growth(unit: Callable[[int], object], count: int) -> float:
 
 def store(**values: str):
     import mitsuba as mi
+    from nerg_mi.scenes.store import SCENE_FILE
 
-    from nerg_mi.workflows.demo import find_store_scene
-
-    return mi.load_file(str(find_store_scene()), **({"width": "36", "height": "24"} | values))
+    return mi.load_file(str(SCENE_FILE), **({"width": "36", "height": "24"} | values))
 
 
 def frames() -> Callable[[int], None]:

@@ -57,7 +57,7 @@ def write_photos(folder: Path, count: int = 12) -> Path:
 
 def simulate_gaze(count: int = 400):
     """Simulate recordings of two participants who walk around and look at one point of the wall x = 1.5."""
-    from nerg_mi.rays.rays import Rays
+    from nerg_mi.tracking.rays import Rays
 
     rng = np.random.default_rng(0)
     origin = np.stack(

@@ -22,7 +22,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 
-SKIPPED = {"CHANGELOG.md", "docs/reference/commands.md", "tools/words.py", "tools/backticks.py"}
+SKIPPED = {"CHANGELOG.md", "tools/words.py", "tools/backticks.py"}
 """Files that name what does not exist, or are generated from strings."""
 
 PACKAGES = ("builtins", "dataclasses", "drjit", "io", "mitsuba", "numpy", "os", "scipy", "typing")
@@ -33,7 +33,7 @@ EXTERNAL = set(
     array_like concurrent futures mutmut noqa pyright ssh trapz
     align_corners also_copy coverage.py data_range gaussian_weights general_roc geo_feat get_depth_image_from_path
     get_grid_index hook_type jit_llvm_set_target pkg_resources projectaria_tools pytest_add_cli_args_test_selection
-    render_sample show_completion source_paths use_sample_covariance vector_width
+    install_completion render_sample show_completion source_paths use_sample_covariance vector_width
     CUDA_VISIBLE_DEVICES CameraHandle DeviceCadExtrinsics EyeGazeReader GazeColumns GazeValidity GaussianMixture
     GetGazeRay NeRFNetwork RBIntegrator gaze_prediction.py network.py processPlyBuffer projectPoints
     _test _val black_transparent exiftool left_eye_validity nerfw nerg_ep ngp_ep sharpen shutter_close

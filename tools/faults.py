@@ -1,6 +1,6 @@
 """Kill tests: a killed command never leaves a damaged file.
 
-    python -m tools.faults [--tries 100] [--only WORD] [--update docs/explanation/robustness.md]
+    python -m tools.faults [--tries 100] [--only WORD]
 
 Commands run in a folder with an earlier result of each. Every second try is killed (SIGKILL) at a time spread evenly
 over its usual run; the others are killed as soon as a file is being written. Afterwards every file of the folder must
@@ -21,11 +21,14 @@ import struct
 import sys
 import tempfile
 import time
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import nerg_mi  # noqa: F401 (before Mitsuba, since it chooses the libLLVM)
-from tools.page import table, update_table
+from tools.results import save
+from tools.with_defaults import find_defaults
 
 
 @dataclass(frozen=True)
@@ -34,7 +37,7 @@ class Command:
 
     ``line`` are the arguments of `nerg`, with OUT for the output and IN for the folder of inputs; ``output`` is the
     name of the output, ``made`` lists the files that it writes, ``weight`` is its relative number of tries, and
-    ``state`` is the file from which --resume continues.
+    ``state`` is the file from which --resume continues. ``defaults`` are those of parameters without an option.
     """
 
     name: str
@@ -43,28 +46,31 @@ class Command:
     outputs: tuple[str, ...]
     weight: int
     state: str = ""
+    defaults: Mapping[str, Any] = field(default_factory=dict)
 
     def arguments(self, inputs: Path, output: Path) -> list[str]:
         return [w.replace("IN", str(inputs)).replace("OUT", str(output)) for w in self.line.split()]
 
 
-_GAZE = "--geometry none --validation-zones 0 --radius 0.5 --probes 16 --min-rays 8 --directions 64"
+_GAZE = "--environment none --radius 0.5 --min-rays 8"
 COMMANDS = (
     Command(
         "train radiance",
-        "train radiance IN/photos -o OUT --steps 25 --save-every 0.5 --holdout 0",
+        "train radiance IN/photos -o OUT --steps 25 --holdout 0",
         "field.safetensors",
         ("field.safetensors",),
         6,
         "field.run",
+        {"save_every": 0.5},
     ),
     Command(
         "train gaze",
-        f"train gaze IN/rays.npz -o OUT --steps 200 --save-every 0.02 {_GAZE}",
+        f"train gaze IN/rays.npz -o OUT --steps 200 {_GAZE}",
         "gaze.safetensors",
         ("gaze.safetensors",),
         14,
         "gaze.run",
+        {"save_every": 0.02, "validation_zones": 0, "probes": 16, "directions": 64},
     ),
     Command(
         "rays import",
@@ -216,7 +222,7 @@ def read_whole(path: Path) -> None:
 
         assert load(data)
     elif path.suffix == ".npz":
-        from nerg_mi.rays.rays import Rays
+        from nerg_mi.tracking.rays import Rays
 
         assert len(Rays.load(path))
     elif path.suffix == ".ply":
@@ -264,8 +270,8 @@ def write_inputs(folder: Path) -> None:
     import shutil
 
     import mitsuba as mi
+    from nerg_mi.scenes.store import SCENE_FILE
 
-    from nerg_mi.workflows.demo import find_store_scene
     from tests import tiny
 
     mi.set_variant("scalar_rgb")
@@ -273,7 +279,7 @@ def write_inputs(folder: Path) -> None:
     tiny.write_tracking(folder / "track.csv", 40_000)
     tiny.simulate_gaze(2_000).save(folder / "rays.npz")
     for name in ("scene.xml", "store.safetensors", "shoppers.safetensors"):
-        shutil.copy(find_store_scene().parent / name, folder / name)
+        shutil.copy(SCENE_FILE.parent / name, folder / name)
 
 
 def make_arguments(command: Command, inputs: Path, out: Path) -> list[str]:
@@ -287,6 +293,7 @@ def try_kills(command: Command, inputs: Path, out: Path, tries: int, seed: int =
     tally, turn, log = Tally(), random.Random(seed), out.parent / "log.txt"
     if "place" in command.output:
         (out / command.output).write_bytes((inputs / "rays.npz").read_bytes())
+    find_defaults(command.line.split()).update(command.defaults)
     since = time.monotonic()
     _require_success(command, wait_for(start_process(make_arguments(command, inputs, out), log)), log)
     usual = time.monotonic() - since
@@ -348,7 +355,6 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--tries", type=int, default=100, help="total number of kills")
     parser.add_argument("--only", default="", help="only commands with this word in their name")
-    parser.add_argument("--update", type=Path, help="page whose table is replaced")
     options = parser.parse_args(arguments)
     # Loaded here, so that child processes have it; it must not be used in this process.
     import matplotlib  # noqa: F401
@@ -358,7 +364,7 @@ def main(arguments: list[str] | None = None) -> int:
         work.chmod(0o755)
         _write_inputs_in_process(inputs)
         rows = run_kills(work, inputs, options.tries, options.only)
-    update_table(options.update, "Faults", table(HEADER, rows))
+    save("faults", HEADER, rows)
     return int(any(row[3] for row in rows))
 
 

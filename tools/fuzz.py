@@ -1,7 +1,6 @@
 """Fuzz every reader with damaged files and count the outcomes.
 
     python -m tools.fuzz [--kind damage] [--cases 20000] [--start 1] [--only NAME] [--keep]
-        [--update docs/explanation/robustness.md]
 
 Each reader gets the same number of cases, which depend only on ``--start``. ``--kind damage``: bytes and structure,
 drawn by hypothesis (tests/fuzz/mutations.py); ``semantic``: inconsistent files, and FIFOs, devices and links in place
@@ -23,7 +22,7 @@ from pathlib import Path
 import nerg_mi  # noqa: F401 (before Mitsuba, since it chooses the libLLVM)
 from tests.fuzz import cases, commands, readers, semantic
 from tests.fuzz.watch import BREACHES, CORPUS, corpus_name, run_cases
-from tools.page import table, update_table
+from tools.results import save
 
 HEADER = (
     "reader",
@@ -54,7 +53,6 @@ def main() -> int:
     parser.add_argument("--start", type=int, default=1, help="seed of the cases (default: 1); the tests use 0")
     parser.add_argument("--only", help="only readers whose name contains this")
     parser.add_argument("--keep", action="store_true", help="store violations in tests/fuzz/corpus")
-    parser.add_argument("--update", type=Path, help="page whose table below the heading Readers is replaced")
     options = parser.parse_args()
 
     import mitsuba as mi
@@ -79,7 +77,7 @@ def main() -> int:
                     if options.keep and not case.special:
                         (CORPUS / corpus_name(case)).write_bytes(case.data)
         except KeyboardInterrupt:
-            # Show the results so far, but do not update the page.
+            # Show the readers tested so far.
             interrupted = True
     rows = [
         _make_row(r.name, outcomes[r.name], max_seconds[r.name], max_memory[r.name])
@@ -89,7 +87,7 @@ def main() -> int:
     rows.append(
         _make_row("all", sum(outcomes.values(), Counter()), max(max_seconds.values()), max(max_memory.values()))
     )
-    update_table(None if interrupted else options.update, "Readers", table(HEADER, rows))
+    save(f"fuzz-{options.kind}", HEADER, rows, str(options.start))
     if interrupted:
         return 130
     return 1 if broken else 0

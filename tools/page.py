@@ -1,15 +1,13 @@
-"""Tables that commands print and write into pages of the documentation."""
+"""Source of the pages of the manual: tables with aligned columns, and lines that are not too long."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 
-from nerg_mi.files.atomic import write_text
 from nerg_mi.files.tables import format_markdown_table as table
 
-__all__ = ["aligned", "cells", "replace_table", "table", "table_or_list", "update_table", "wrapped"]
+__all__ = ["aligned", "cells", "table", "table_or_list", "wrapped"]
 
 WIDTH = 100
 """Columns of a line of source."""
@@ -141,34 +139,3 @@ def _filled(lines: Sequence[str], width: int) -> list[str]:
             line = rest
         line += word if line in (first, rest) else f" {word}"
     return [*out, line.rstrip()]
-
-
-def replace_table(document: str, title: str, text: str) -> str:
-    """Replace the first table below the heading ``title`` of ``document`` by ``text``, or add ``text`` there.
-
-    The heading is of the second or third level. Raises ``ValueError`` if there is no such heading.
-    """
-    lines = document.split("\n")
-    mark = next((mark for mark in ("##", "###") if f"{mark} {title}" in lines), None)
-    if mark is None:
-        raise ValueError(f'the document has no heading "## {title}" for the table; add it')
-    start = lines.index(f"{mark} {title}") + 1
-    # The section ends at the next heading of the same or a higher level.
-    ends = tuple(f"{'#' * level} " for level in range(2, len(mark) + 1))
-    stop = next((k for k in range(start, len(lines)) if lines[k].startswith(ends)), len(lines))
-    first = next((k for k in range(start, stop) if lines[k].startswith("|")), None)
-    if first is None:
-        last = stop
-        while last > start and not lines[last - 1].strip():
-            last -= 1
-        return "\n".join([*lines[:last], "", *text.split("\n"), "", *lines[stop:]]).rstrip("\n") + "\n"
-    end = next((k for k in range(first, stop) if not lines[k].startswith("|")), stop)
-    return "\n".join([*lines[:first], *text.split("\n"), *lines[end:]])
-
-
-def update_table(path: str | Path | None, title: str, text: str) -> None:
-    """Print ``text`` and, if ``path`` is given, write it into that page."""
-    print(text)
-    if path is not None:
-        path = Path(path)
-        write_text(path, replace_table(path.read_text(encoding="utf-8"), title, aligned(text)))

@@ -32,7 +32,7 @@ from PIL import Image
 ROOT = Path(__file__).resolve().parents[1]
 STORE = ROOT / "scenes" / "store"
 # Not the installed script, so that a tree with another entry point also works.
-NERG = [sys.executable, "-c", "from nerg_mi.cli import main; main()"]
+NERG = [sys.executable, "-m", "tools.with_defaults"]
 SIZE = ["-D", "width=96", "-D", "height=64", "-D", "sphere_width=96", "-D", "sphere_height=48", "-D", "spp=2"]
 ALL_AOVS = "depth,opacity,position,gaze,emit,capture,visibility,observer_depth,features,features_at"
 COUNTS = "depth,gaze,gaze_evals,density_evals,color_evals"
@@ -49,17 +49,16 @@ VIEWS = [
 TARGET = (4.8, 4.2, 1.0)
 GAZE = {
     "default": ["--recipe", "default", "--steps", "12", "--test-zones", "2", "--test-positions", "8"],
-    "small": ["--recipe", "small", "--steps", "12", "--validation-zones", "0"],
-    "paper": ["--recipe", "paper", "--size", "small", "--steps", "6", "--validation-zones", "0"],
+    "small": ["--recipe", "small", "--steps", "12"],
+    "paper": ["--recipe", "paper", "--steps", "2"],
     "emit": ["--recipe", "default", "--variant", "emit", "--steps", "6"],
-    "capture": ["--recipe", "small", "--variant", "capture", "--steps", "6", "--validation-zones", "0"],
-    "zones": ["--recipe", "default", "--validation-zones", "2", "--steps", "10"],
-    "snapshot": ["--recipe", "small", "--semantic", "snapshot", "--steps", "6", "--validation-zones", "0"],
-    "accumulated": "--recipe small --semantic accumulated --semantic-concat --steps 6 --validation-zones 0".split(),
-    "normalized": ["--recipe", "small", "--normalize", "--steps", "6", "--validation-zones", "0"],
+    "capture": ["--recipe", "small", "--variant", "capture", "--steps", "6"],
+    "zones": ["--recipe", "default", "--steps", "10"],
     "ensemble": ["--recipe", "default", "--ensemble", "2", "--steps", "6"],
 }
 """Gaze fields by name, and the options that train them."""
+VALIDATION_ZONES = {"small": 0, "paper": 0, "capture": 0, "zones": 2}
+"""Zones of positions for validation, of fields where the recipe does not set them."""
 PICTURES = {
     "plain": [],
     "all_aovs": ["aovs=" + ALL_AOVS],
@@ -145,16 +144,18 @@ def iter_commands(folder: Path) -> Iterator[tuple[str, list[str]]]:
     yield "place.ply", ["export", "points", str(folder / "place.safetensors")]
     yield "place.vol", ["export", "volume", str(folder / "place.safetensors"), "--resolution", "24"]
     for name, options in GAZE.items():
+        defaults = ["probes=60"]
+        if name in VALIDATION_ZONES:
+            defaults.append(f"validation_zones={VALIDATION_ZONES[name]}")
         yield (
             f"gaze_{name}.safetensors",
             [
+                *defaults,
                 "train",
                 "gaze",
                 rays,
-                "--field",
+                "--environment",
                 str(STORE / "store.safetensors"),
-                "--probes",
-                "60",
                 "--min-rays",
                 "8",
                 *options,
@@ -172,18 +173,17 @@ def iter_commands(folder: Path) -> Iterator[tuple[str, list[str]]]:
     yield (
         "eval",
         [
+            "pictures=1",
             "eval",
             "gaze",
             str(folder / "gaze_default.safetensors"),
             rays,
-            "--field",
+            "--environment",
             str(STORE / "store.safetensors"),
             "--min-rays",
             "8",
             "--resamples",
             "20",
-            "--pictures",
-            "1",
             *one,
         ],
     )

@@ -8,21 +8,23 @@ from typing import Annotated, Any
 import numpy as np
 
 from nerg_mi.environment.environment import Environment
+from nerg_mi.environment.scene_loading import activate_mitsuba
 from nerg_mi.errors import NergError, parameter
 from nerg_mi.figures.maps import alignment_figure
 from nerg_mi.figures.style import changed_arguments, make_provenance, save
 from nerg_mi.files.atomic import check_writable, file_sha256
 from nerg_mi.files.values import FilePath, to_path
+from nerg_mi.formats.alignments import Alignment, read_similarity
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.options import parse_point
 from nerg_mi.photos.colmap import rotation_to_z
+from nerg_mi.photos.posed import Photos
 from nerg_mi.progress import Progress, Reporter, open_reporter
 from nerg_mi.ranges import COORDINATES, LENGTHS, SEEDS, Range, check_ranges
-from nerg_mi.rays.direction_checks import DECLARED
-from nerg_mi.rays.rays import Rays
-from nerg_mi.rendering.scene import activate_mitsuba
+from nerg_mi.tracking.direction_checks import DECLARED
+from nerg_mi.tracking.rays import Rays
 
-from .check import Alignment, check_alignment, read_similarity
+from .check import check_alignment, record_fit
 from .constraints import AlignmentFit, AlignmentTarget, Evidence, read_surface, trace_scene
 from .icp import Twin
 from .points import read_cameras, read_pairs
@@ -42,8 +44,8 @@ def align(
     surface: FilePath | None = None,
     pairs: FilePath | None = None,
     tracking_surface: FilePath | None = None,
-    tracking_cameras: FilePath | None = None,
-    scene_cameras: FilePath | None = None,
+    tracking_cameras: Photos | FilePath | None = None,
+    scene_cameras: Photos | FilePath | None = None,
     init: Alignment | FilePath | None = None,
     refine: bool = False,
     up: str | None = None,
@@ -77,9 +79,9 @@ def align(
         Three or more point correspondences: CSV with columns x,y,z,place_x,place_y,place_z, or JSON.
     tracking_surface : path, optional
         Surface in the frame of the tracking, a mesh or points as for ``surface``; it is registered by ICP.
-    tracking_cameras : path, optional
+    tracking_cameras : Photos or path, optional
         Posed photos in the frame of the tracking (transforms.json, COLMAP); needs ``scene_cameras``.
-    scene_cameras : path, optional
+    scene_cameras : Photos or path, optional
         The same photos posed in the frame of the scene (transforms.json, COLMAP).
     init : Alignment or path, optional
         Approximate alignment (.json) that the tracking refines.
@@ -113,7 +115,8 @@ def align(
     Returns
     -------
     Alignment
-        The transform and its quality.
+        The transform and its quality. The residuals are those of the evidence that was fitted, and not of other
+        evidence; the uncertainty is that of the transform.
 
     Raises
     ------
@@ -186,7 +189,7 @@ def align(
         if scene is not None and "environment" in sources:
             sources = {scene.kind: sources.pop("environment"), **sources}
         files = {name: {"file": path.name, "sha256": file_sha256(path)} for name, path in sources.items()}
-        result = Alignment.from_fit(evidence.kind, fit, files, bool(rejection))
+        result = record_fit(evidence.kind, fit, files, bool(rejection))
         _report_alignment(result, reporter)
         if scene is not None and data is not None:
             _report_check(scene, data, result.matrix, reporter)
@@ -207,7 +210,7 @@ def _read_evidence(
     rays: Rays | None,
     pairs: FilePath | None,
     tracking_surface: FilePath | None,
-    cameras: tuple[FilePath, FilePath] | None,
+    cameras: tuple[Photos | FilePath, Photos | FilePath] | None,
     init: Alignment | FilePath | None,
     seed: int,
     on_note: Callable[[str], None],
@@ -226,7 +229,7 @@ def _read_evidence(
         points = read_surface(to_path(tracking_surface), on_note=on_note)
         return Twin(points, f'the tracking surface "{tracking_surface}"')
     if cameras is not None:
-        return read_cameras(to_path(cameras[0]), to_path(cameras[1]))
+        return read_cameras(*cameras)
     if rays is None:
         raise NergError(
             f"no evidence is given: name a rays file (tracking alone), or add {parameter('pairs', 'FILE')}, "

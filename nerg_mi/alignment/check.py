@@ -1,28 +1,25 @@
-"""Plausibility check of rays in a scene, and ``alignment.json``, the record of an alignment."""
+"""Plausibility check of rays in a scene, and the record of a fit."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from pathlib import Path
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError, sanitize
-from nerg_mi.files.safe_read import read_json
-from nerg_mi.files.schema import NUMBER, Items, check_json
-from nerg_mi.files.tables import write_json
+from nerg_mi.formats.alignments import Alignment
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.rays.direction_checks import compute_hit_fractions, describe_mirroring
-from nerg_mi.rays.rays import Rays
+from nerg_mi.maths.transforms import similarity_scale
+from nerg_mi.tracking.direction_checks import compute_hit_fractions, describe_mirroring
+from nerg_mi.tracking.rays import Rays
 from nerg_mi.transport.geometry import SceneGeometry, trace_depth
 from nerg_mi.transport.medium import Medium
 
-from .constraints import AlignmentFit, Interval
+from .constraints import AlignmentFit
 from .profile import LEVEL
-from .similarity import similarity_scale, transform_points
+from .similarity import transform_points
 
 # ---- Check ----
 #
@@ -98,136 +95,17 @@ def check_alignment(geometry: Medium | SceneGeometry, rays: Rays, align: Similar
     return AlignmentCheck(escaped, float((tight_fraction >= _TIGHT_FRACTION).mean()), float(below.mean()), mirrored)
 
 
-# ---- Record ----
-#
-# ``alignment.json`` stores a similarity with its evidence, residuals and uncertainty. Options that take an alignment
-# (``--align``) read this file, or a JSON list of the four rows of the matrix.
-
-KIND, VERSION = "alignment", 1
-
-_MAX_BYTES = 4 << 20
-_ROWS, _ENDS = Items(Items(NUMBER, 4, 4), 4, 4), Items(NUMBER, 2, 2)
-_UNCERTAINTY = {"turn_degrees": _ENDS, "scale": _ENDS, "shift_cm": NUMBER}
+# ---- Record of a fit ----
 
 
-@dataclass(frozen=True, eq=False)
-class Alignment:
-    """An alignment and its record. All fields except the matrix are JSON values.
-
-    Parameters
-    ----------
-    matrix
-        Similarity (4, 4) from the tracking frame (z up, metres) to the scene.
-    evidence
-        Kind of evidence and its figures.
-    residuals
-        Median and 95th percentile in centimetres and degrees.
-    uncertainty
-        Standard deviation of position (cm), rotation (degrees) and scale (percent), or the `Interval` of samples
-        without hit points; None if unknown.
-    files
-        Names and checksums of the input files.
-    forced
-        Whether it was written in spite of a failed check.
-    """
-
-    matrix: np.ndarray
-    evidence: dict[str, Any]
-    residuals: dict[str, Any]
-    uncertainty: dict[str, Any] | None
-    files: dict[str, Any] = field(default_factory=dict)
-    forced: bool = False
-
-    def __repr__(self) -> str:
-        residual = self.residuals.get("median_cm")
-        fit = "" if residual is None else f", median residual {residual:.3g} cm"
-        return f"<Alignment: {self.evidence.get('kind', 'matrix')}, scale {similarity_scale(self.matrix):.4g}{fit}>"
-
-    @classmethod
-    def from_fit(cls, kind: str, fit: AlignmentFit, files: Mapping[str, Any], forced: bool) -> Alignment:
-        """Create the record of a fit."""
-        residuals = {
-            "count": len(fit.residuals_cm),
-            **_percentiles(fit.residuals_cm, "cm"),
-            **_percentiles(fit.residuals_deg, "degrees"),
-        }
-        return cls(fit.matrix, {"kind": kind, **fit.metadata}, residuals, _uncertainty(fit), dict(files), forced)
-
-    def save(self, path: Path) -> None:
-        """Write the file atomically."""
-        data = {
-            "kind": KIND,
-            "version": VERSION,
-            "from": "tracking",
-            "to": "place",
-            "matrix": self.matrix.tolist(),
-            "scale": similarity_scale(self.matrix),
-            "evidence": self.evidence,
-            "residuals": self.residuals,
-            "uncertainty": self.uncertainty,
-            "files": self.files,
-            "forced": self.forced,
-        }
-        write_json(path, data, allow_nan=False)
-
-
-def read_similarity(
-    path: Path, option: str, frames: str, on_doubt: Callable[[str], None] = lambda reason: None
-) -> Similarity:
-    """Read a similarity from a JSON file, an alignment or four rows.
-
-    Parameters
-    ----------
-    path
-        JSON file.
-    option
-        Option that named the file, for messages.
-    frames
-        Source and target frame, such as "rays to field", for messages.
-    on_doubt
-        Called with a message if the evidence of the alignment did not determine it.
-
-    Raises
-    ------
-    NergError
-        If the file does not contain a similarity.
-    """
-    data: Any = read_json(path, f"similarity of {option}", _MAX_BYTES)
-    if isinstance(data, dict):
-        if data.get("kind") != KIND or "matrix" not in data:
-            raise NergError(
-                f'{option} needs a JSON file with the 4 rows of a similarity from {frames}; "{path}" is neither '
-                'that nor an output of "nerg align"'
-            )
-        version = data.get("version")
-        if not isinstance(version, int) or isinstance(version, bool) or not 1 <= version <= VERSION:
-            raise NergError(
-                f'the alignment "{path}" has version {sanitize(version, 40)}, but at most {VERSION} is supported; '
-                "update nerg_mi"
-            )
-        _report_doubt(data.get("uncertainty"), path, on_doubt)
-        data = data["matrix"]
-    try:
-        return Similarity(np.array(check_json(data, _ROWS, "matrix"), np.float64))
-    except ValueError as error:
-        raise NergError(
-            f'{option} needs a JSON file with the 4 rows of a similarity from {frames}; "{path}": {sanitize(error)}'
-        ) from error
-
-
-def _report_doubt(uncertainty: Any, path: Path, on_doubt: Callable[[str], None]) -> None:
-    if not isinstance(uncertainty, dict) or "turn_degrees" not in uncertainty:
-        return
-    try:
-        check_json(uncertainty, _UNCERTAINTY, "uncertainty")
-        turn, scale = (tuple(uncertainty[k]) for k in ("turn_degrees", "scale"))
-        reason = Interval(turn, scale, uncertainty["shift_cm"] / 100).rejection_reason()
-    except ValueError as error:
-        raise NergError(
-            f'the uncertainty in "{path}" is not an interval of "nerg align" ({sanitize(error)}); run it again'
-        ) from error
-    if reason:
-        on_doubt(f'in "{path}", {reason}, and run "nerg align" again')
+def record_fit(kind: str, fit: AlignmentFit, files: Mapping[str, Any], forced: bool) -> Alignment:
+    """Return the record of a fit by evidence of that ``kind``."""
+    residuals = {
+        "count": len(fit.residuals_cm),
+        **_percentiles(fit.residuals_cm, "cm"),
+        **_percentiles(fit.residuals_deg, "degrees"),
+    }
+    return Alignment(fit.matrix, {"kind": kind, **fit.metadata}, residuals, _uncertainty(fit), dict(files), forced)
 
 
 def _percentiles(values: np.ndarray, unit: str) -> dict[str, float | None]:

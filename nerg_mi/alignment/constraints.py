@@ -13,15 +13,17 @@ from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_ed
 
 from nerg_mi.errors import MissingFile, NergError, parameter
 from nerg_mi.files.safe_read import read_npy
+from nerg_mi.formats.alignments import Interval
 from nerg_mi.formats.meshes import READERS, read_mesh_file
 from nerg_mi.maths.coordinates import check_coordinates, check_near_origin
 from nerg_mi.maths.sphere import sample_uniform_directions
+from nerg_mi.maths.transforms import similarity_scale
 from nerg_mi.photos.posed import read_semidense
-from nerg_mi.rays.readers.tables import iterate_table, read_table_columns
+from nerg_mi.tracking.readers.tables import iterate_table, read_table_columns
 from nerg_mi.transport.geometry import SceneGeometry, trace_depth
 from nerg_mi.transport.medium import Medium
 
-from .similarity import FULL_BASIS, LocalSimilarity, similarity_scale, transform_points, vertical_rotation
+from .similarity import FULL_BASIS, LocalSimilarity, transform_points, vertical_rotation
 
 # ---- Distance grid ----
 
@@ -421,50 +423,6 @@ class AlignmentTarget:
     def to_scene_frame(self, matrix: np.ndarray) -> np.ndarray:
         """Convert a similarity to the z-up frame into one to the frame of the scene."""
         return np.linalg.inv(self.to_z_up) @ matrix
-
-
-MAX_TURN, MAX_SCALE, MAX_SHIFT = 10.0, 1.1, 1.0
-"""Maximum widths of the intervals of a determined alignment: degrees, ratio of the scales, and metres between head
-positions."""
-
-
-@dataclass(frozen=True)
-class Interval:
-    """What the samples leave open about an alignment.
-
-    ``turn``: smallest and largest rotation about the vertical axis in degrees, relative to the result; ``scale``:
-    smallest and largest scale; ``shift``: largest distance in metres (median over the heads) between the head positions
-    of the result and those of another placement that fits.
-    """
-
-    turn: tuple[float, float]
-    scale: tuple[float, float]
-    shift: float
-
-    def describe(self) -> str:
-        """Return the interval in words."""
-        return (
-            f"turns from {self.turn[0]:+.3g} to {self.turn[1]:+.3g} degrees about the result, scales from "
-            f"{self.scale[0]:.3g} to {self.scale[1]:.3g}, and heads {self.shift:.2g} m from it agree with the samples "
-            "about equally well"
-        )
-
-    def rejection_reason(self) -> str:
-        """Return what is not determined, with a remedy, or an empty string."""
-        names = []
-        if self.turn[1] - self.turn[0] > MAX_TURN:
-            names.append("turn")
-        if self.scale[1] > MAX_SCALE * self.scale[0]:
-            names.append("scale")
-        if self.shift > MAX_SHIFT:
-            names.append("shift")
-        if not names:
-            return ""
-        remedies = ", ".join(parameter(name) for name in names)
-        return (
-            f"the samples do not determine the {' and the '.join(names)}: {self.describe()}; give {remedies} if "
-            f"you know the value, picked points ({parameter('pairs')}), or samples with hit points"
-        )
 
 
 @dataclass(frozen=True, eq=False)

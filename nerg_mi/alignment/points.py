@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 from nerg_mi.errors import NergError, parameter, sanitize
 from nerg_mi.files.safe_read import check_regular_file, read_json, translate_read_errors
 from nerg_mi.files.schema import NUMBER, Items, check_json
-from nerg_mi.photos.colmap import find_pose_source
-from nerg_mi.photos.images import read_posed_images
-from nerg_mi.photos.posed import PosedImages, describe_unused
-from nerg_mi.rays.readers.columns import open_named_table
+from nerg_mi.files.values import FilePath
+from nerg_mi.photos.images import open_photos
+from nerg_mi.photos.posed import Photos, describe_unused
+from nerg_mi.tracking.readers.columns import open_named_table
 
 from .constraints import (
     AlignmentFit,
@@ -159,26 +159,26 @@ def _fit_scale_and_shift(x: np.ndarray, y: np.ndarray, fixed_scale: float | None
     return scale, shift
 
 
-def read_cameras(tracking: Path, environment: Path) -> Cameras:
-    """Read the poses of the photos that two models (transforms.json or COLMAP) have in common, matched by file name.
+def read_cameras(tracking: Photos | FilePath, environment: Photos | FilePath) -> Cameras:
+    """Return the poses that two models (transforms.json or COLMAP) have in common, matched by file name.
 
     Raises `NergError` if there are fewer than two.
     """
-    models = [read_posed_images(find_pose_source(path)) for path in (tracking, environment)]
+    models = [open_photos(photos) for photos in (tracking, environment)]
     for key in (_path_key, _name_key):
         tables = [_poses_by_name(model, key) for model in models]
         common = sorted(set(tables[0]) & set(tables[1]))
         if len(common) >= 2:
             a, b = (np.stack([t[name] for name in common]) for t in tables)
             notes = tuple(note for model in models for note in (*describe_unused(model.unused), *model.notes))
-            return Cameras(a, b, f'the cameras of "{tracking}" and "{environment}"', notes)
+            return Cameras(a, b, f'the cameras of "{models[0].path}" and "{models[1].path}"', notes)
     raise NergError(
-        f'"{tracking}" and "{environment}" have fewer than two photos with the same name; give two models of the same '
-        "photos"
+        f'"{models[0].path}" and "{models[1].path}" have fewer than two photos with the same name; give two models '
+        "of the same photos"
     )
 
 
-def _poses_by_name(model: PosedImages, key) -> dict[str, np.ndarray]:
+def _poses_by_name(model: Photos, key) -> dict[str, np.ndarray]:
     return {key(f.name): f.to_world for f in model.frames}
 
 

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from nerg_mi.errors import NergError, parameter
 from nerg_mi.maths.coordinates import check_coordinates
+from nerg_mi.maths.transforms import similarity_scale
 
 # ---- Closed-form fit ----
 #
@@ -102,11 +103,6 @@ def vertical_rotation(angle: float) -> np.ndarray:
 def transform_points(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Transform ``points`` (..., 3) by a matrix (4, 4)."""
     return points @ matrix[:3, :3].T + matrix[:3, 3]
-
-
-def similarity_scale(matrix: np.ndarray) -> float:
-    """Return the scale of a similarity: units of the target per unit of the source."""
-    return float(np.cbrt(abs(np.linalg.det(matrix[:3, :3]))))
 
 
 def turn_between(a: np.ndarray, b: np.ndarray) -> float:

@@ -2,38 +2,60 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, sanitize
+from nerg_mi.files.tables import unescape_formula
 from nerg_mi.files.values import to_name
-from nerg_mi.formats.areas import Region
-from nerg_mi.measures.shares import VisibilityCache
-from nerg_mi.measures.visits import (
-    ALL,
-    Aoi,
-    Cell,
+from nerg_mi.formats.boxes import Region
+from nerg_mi.tracking.dataset import RayDataset, is_dataset
+from nerg_mi.tracking.filters import argsort_by_person_time
+from nerg_mi.tracking.rays import Rays, merge_rays
+from nerg_mi.tracking.readers.columns import open_named_table
+
+from .areas import AreaGroup
+from .placed import (
     HitAssignment,
-    VisitRules,
-    Visits,
-    VisitSums,
+    PlacedAreas,
     assign_hits,
     concatenate_hits,
-    find_visits,
-    make_timeline,
     merge_directions,
     merge_members,
     sample_cone,
-    sum_visits,
 )
-from nerg_mi.rays.dataset import RayDataset, is_dataset
-from nerg_mi.rays.filters import argsort_by_person_time
-from nerg_mi.rays.rays import Rays, merge_rays
+from .settings import VisitRules
+from .shares import SamplePoints, VisibilityCache
+from .visits import ALL, Cell, Visits, VisitSums, find_visits, make_timeline, sum_visits
 
-from .scene import GazeScene
+# ---- Cohorts ----
+
+MAX_PARTICIPANTS = 10_000_000  # maximum number of participants in a table of cohorts
+
+
+def read_cohorts(path: Path) -> dict[str, str]:
+    """Read the cohort of each participant from a CSV file with columns ``person`` (or ``participant``) and ``cohort``.
+
+    Rows without a name or a cohort, as at the end of many tables, are ignored. Raises `NergError` for missing columns,
+    and for a participant in two cohorts.
+    """
+    cohorts: dict[str, str] = {}
+    for block in open_named_table(path, (), ("person", "cohort"))[1]:
+        for participant, cohort in (map(to_name, map(unescape_formula, row)) for row in block.texts.tolist()):
+            if participant and cohort and cohorts.setdefault(participant, cohort) != cohort:
+                raise NergError(f'"{path}" has "{sanitize(participant, 40)}" in two cohorts; remove one of them')
+        if len(cohorts) > MAX_PARTICIPANTS:
+            raise NergError(f'"{path}" names more than {MAX_PARTICIPANTS:,} participants; remove some')
+    if not cohorts:
+        raise NergError(
+            f'"{path}" contains no participants; write the header person,cohort and one row per participant'
+        )
+    return cohorts
+
 
 # ---- Sums of samples ----
 
@@ -50,66 +72,80 @@ class TimeWindow:
     end: float
 
 
+@dataclass(frozen=True)
+class Counting:
+    """Which visits are counted, and in which cells.
+
+    Parameters
+    ----------
+    rules
+        Definition of sessions and visits.
+    windows, zones
+        Time windows, and zones of the floor.
+    cohorts
+        File with the cohort of each participant (`read_cohorts`). None: the cohorts of the samples.
+    aoi_visibility
+        Whether the visibility of AOIs is analysed.
+    fov
+        Angle of the field of view in degrees.
+    """
+
+    rules: VisitRules = VisitRules()
+    windows: tuple[TimeWindow, ...] = ()
+    zones: tuple[Region, ...] = ()
+    cohorts: Path | None = None
+    aoi_visibility: bool = False
+    fov: float = 120.0
+
+
 @dataclass(frozen=True, eq=False)
 class AoiContext:
     """How gaze samples are assigned to areas and cells.
 
     Parameters
     ----------
-    gaze_scene
-        Scene that the samples are traced in.
-    aois
-        Elementary AOIs.
-    names
-        Names of the areas.
-    members
-        Indices into ``aois`` of each area.
-    transition_areas
-        Indices of the areas between which transitions are counted.
-    rules
-        Definition of sessions and visits.
-    margin
-        Surface tolerance in scene units.
-    tolerance
-        Angular tolerance in degrees.
+    placed
+        Areas in the environment that the samples are traced in.
+    counting
+        What is counted.
     use_hit_points
         Whether samples end at their recorded hit points, if surfaces are unknown.
-    fov
-        Angle of the field of view in degrees.
-    visibility_cache
-        Visibility of the AOIs; None if visibility is not analysed.
-    windows, zones
-        Time windows, and zones of the floor.
-    cohorts
-        Cohort of each participant; empty to use the cohorts of the samples.
     cohort_names
-        Names of the cohorts.
+        Names of the cohorts of the samples, which a table of ``counting`` replaces.
     """
 
-    gaze_scene: GazeScene
-    aois: Sequence[Aoi]
-    names: tuple[str, ...]
-    members: Sequence[tuple[int, ...]]
-    transition_areas: Sequence[int]
-    rules: VisitRules
-    margin: float
-    tolerance: float = 0.0
+    placed: PlacedAreas
+    counting: Counting
     use_hit_points: bool = False
-    fov: float = 360.0
-    visibility_cache: VisibilityCache | None = None
-    windows: Sequence[TimeWindow] = ()
-    zones: Sequence[Region] = ()
-    cohorts: dict[str, str] = field(default_factory=dict)
     cohort_names: tuple[str, ...] = ()
+
+    @cached_property
+    def cohorts(self) -> dict[str, str]:
+        """Cohort of each participant in the table; empty without one."""
+        return {} if self.counting.cohorts is None else read_cohorts(self.counting.cohorts)
+
+    @cached_property
+    def visibility_cache(self) -> VisibilityCache | None:
+        """Visibility of the AOIs; None if visibility is not analysed."""
+        if not self.counting.aoi_visibility:
+            return None
+        placed, sampling = self.placed, self.placed.sampling
+        targets = SamplePoints.sample(placed.aois, sampling.aoi_samples)
+        return VisibilityCache(targets, placed.trace_depth, sampling.cell_size * placed.scale, placed.margin)
+
+    @property
+    def transition_areas(self) -> list[int]:
+        """Indices of the areas between which transitions are counted."""
+        return [k for k, area in enumerate(self.placed.areas.areas) if not isinstance(area, AreaGroup)]
 
     def cell_masks(self, rays: Rays, positions: np.ndarray) -> list[tuple[Cell, np.ndarray | None]]:
         """Return the cells with the masks (N,) of their samples; ``positions`` (N, 3) are the origins in the scene."""
         masks: list[tuple[Cell, np.ndarray | None]] = [(ALL, None)]
-        for name in self.cohort_names:
+        for name in sorted(set(self.cohorts.values())) or self.cohort_names:
             masks.append((Cell("cohort", name), self._cohort_mask(rays, name)))
-        for window in self.windows:
+        for window in self.counting.windows:
             masks.append((Cell("window", window.name), (rays.t >= window.start) & (rays.t < window.end)))
-        for zone in self.zones:
+        for zone in self.counting.zones:
             on_floor = np.column_stack([positions[:, :2], np.full(len(positions), zone.center[2])])
             masks.append((Cell("zone", zone.name), zone.contains(on_floor)))
         return masks
@@ -125,20 +161,21 @@ class AoiContext:
     def assign_hits(self, rays: Rays) -> HitAssignment:
         """Assign samples to the areas that they hit; distances are in metres."""
         parts = [self._assign_batch(rays, slice(a, a + _HIT_BATCH)) for a in range(0, max(len(rays), 1), _HIT_BATCH)]
-        hits = merge_members(concatenate_hits(parts), self.members)
-        return HitAssignment(hits.count, hits.rows, tuple(d / self.gaze_scene.scale for d in hits.distance))
+        hits = merge_members(concatenate_hits(parts), self.placed.members)
+        return HitAssignment(hits.count, hits.rows, tuple(d / self.placed.scale for d in hits.distance))
 
     def _assign_batch(self, rays: Rays, rows: slice) -> HitAssignment:
-        scene = self.gaze_scene
-        o, d = scene.transform_points(rays.origin[rows]), scene.transform_directions(rays.direction[rows])
+        placed, environment = self.placed, self.placed.environment
+        o, d = environment.points_to_field(rays.origin[rows]), environment.directions_to_field(rays.direction[rows])
         hit_depth: np.ndarray | None = None
         if self.use_hit_points and rays.hit is not None:
-            distance = np.linalg.norm(rays.hit[rows] - rays.origin[rows], axis=1) * scene.scale
+            distance = np.linalg.norm(rays.hit[rows] - rays.origin[rows], axis=1) * placed.scale
             hit_depth = np.where(np.isfinite(distance), distance, np.inf)
         hits = []
-        for direction in sample_cone(d, self.tolerance) if self.tolerance > 0 else [d]:
-            depth = hit_depth if scene.geometry is None else scene.trace_depth(o, direction)
-            hits.append(assign_hits(self.aois, o, direction, depth, self.margin))
+        tolerance = placed.sampling.tolerance
+        for direction in sample_cone(d, tolerance) if tolerance > 0 else [d]:
+            depth = hit_depth if environment.medium is None else environment.trace_depth(o, direction)
+            hits.append(assign_hits(placed.aois, o, direction, depth, placed.margin))
         return hits[0] if len(hits) == 1 else merge_directions(hits)
 
     def visibility(self, rays: Rays) -> np.ndarray | None:
@@ -146,18 +183,19 @@ class AoiContext:
         analysed."""
         if self.visibility_cache is None:
             return None
-        out = np.zeros((len(rays), len(self.names)), bool)
+        environment = self.placed.environment
+        out = np.zeros((len(rays), len(self.placed.areas.names)), bool)
         for a in range(0, len(rays), _HIT_BATCH):
             part = slice(a, a + _HIT_BATCH)
-            observers = self.gaze_scene.transform_points(rays.origin[part])
+            observers = environment.points_to_field(rays.origin[part])
             point_visibility, cell = self.visibility_cache.get_visibility(observers)
             visible = self.visibility_cache.visible_in_fov(
                 point_visibility[cell],
                 observers,
-                self.gaze_scene.transform_directions(facing_directions(rays)[part]),
-                self.fov,
+                environment.directions_to_field(facing_directions(rays)[part]),
+                self.counting.fov,
             )
-            for k, indices in enumerate(self.members):
+            for k, indices in enumerate(self.placed.members):
                 out[part, k] = visible[:, list(indices)].any(axis=1)
         return out
 
@@ -173,24 +211,24 @@ def facing_directions(rays: Rays) -> np.ndarray:
 def count_block(rays: Rays, context: AoiContext) -> VisitSums:
     """Sum the visits of a block of samples that contains whole sessions.
 
-    The result depends on the arguments only. `nerg_mi.measures.visits.merge_sums` adds the results of the blocks in
+    The result depends on the arguments only. `nerg_mi.aoi.visits.merge_sums` adds the results of the blocks in
     order.
     """
     hits = context.assign_hits(rays)
-    cells = context.cell_masks(rays, context.gaze_scene.transform_points(rays.origin))
-    return sum_visits(
-        rays, hits, context.names, cells, context.rules, context.visibility(rays), context.transition_areas
-    )
+    cells = context.cell_masks(rays, context.placed.environment.points_to_field(rays.origin))
+    names, rules = context.placed.areas.names, context.counting.rules
+    return sum_visits(rays, hits, names, cells, rules, context.visibility(rays), context.transition_areas)
 
 
 def find_area_visits(rays: Rays, context: AoiContext) -> dict[str, Visits]:
     """Return the visits of each area by its name; ``first`` are indices of ``rays``."""
     order = argsort_by_person_time(rays)
     sorted_rays = rays if order is None else rays.select(order)
-    timeline = make_timeline(sorted_rays.person, sorted_rays.t, context.rules)
+    names, rules = context.placed.areas.names, context.counting.rules
+    timeline = make_timeline(sorted_rays.person, sorted_rays.t, rules)
     hits = context.assign_hits(sorted_rays)
-    visits = [find_visits(np.sort(rows), timeline, context.rules) for rows in hits.rows]
-    return {name: v if order is None else replace(v, first=order[v.first]) for name, v in zip(context.names, visits)}
+    visits = [find_visits(np.sort(rows), timeline, rules) for rows in hits.rows]
+    return {name: v if order is None else replace(v, first=order[v.first]) for name, v in zip(names, visits)}
 
 
 def iter_blocks(
@@ -247,8 +285,11 @@ def _split_at_sessions(parts: Iterator[tuple[tuple, Rays]], rules: VisitRules, m
             else:
                 yield pending
         pending_key = key
-        part = _sort_rays(part)
-        boundaries = _session_boundaries(part, rules)
+        order = argsort_by_person_time(part)
+        part = part if order is None else part.select(order)
+        step = np.diff(part.t)
+        is_start = (np.diff(part.person) != 0) | (step > rules.session_gap * (1 + 1e-9))
+        boundaries = np.r_[0, np.flatnonzero(is_start) + 1, len(part)]
         start = 0
         for a, b in zip(boundaries[:-1], boundaries[1:]):
             if b - start > max_samples and a > start:
@@ -260,65 +301,3 @@ def _split_at_sessions(parts: Iterator[tuple[tuple, Rays]], rules: VisitRules, m
         pending = part.select(np.arange(last, len(part)))
     if pending is not None and len(pending):
         yield pending
-
-
-def _sort_rays(rays: Rays) -> Rays:
-    """Sort samples by participant and time. The names need not be sorted again."""
-    order = argsort_by_person_time(rays)
-    return rays if order is None else rays.select(order)
-
-
-def _session_boundaries(rays: Rays, rules: VisitRules) -> np.ndarray:
-    """Return the start rows of the sessions, followed by the number of samples."""
-    step = np.diff(rays.t)
-    is_start = (np.diff(rays.person) != 0) | (step > rules.session_pause * (1 + 1e-9))
-    return np.r_[0, np.flatnonzero(is_start) + 1, len(rays)]
-
-
-@dataclass(frozen=True, eq=False)
-class Viewpoints:
-    """E viewpoints in the scene: ``positions`` and ``facing`` directions (E, 3), names of their participants, and
-    the cells that each belongs to."""
-
-    positions: np.ndarray
-    facing: np.ndarray
-    participants: tuple[str, ...]
-    cells: tuple[frozenset[Cell], ...]
-
-
-class ViewpointSampler:
-    """Selects every n-th sample of a stream as a viewpoint, and at least one per block for each participant."""
-
-    def __init__(self, stride: int):
-        self._stride, self._num_passed = max(1, stride), 0
-        self._poses: list[np.ndarray] = [np.zeros((0, 6))]
-        self._participants: list[str] = []
-        self._cells: list[frozenset[Cell]] = []
-        self._interned: dict[frozenset[Cell], frozenset[Cell]] = {}
-
-    def add(self, rays: Rays, context: AoiContext) -> None:
-        """Select viewpoints from a block."""
-        number = self._num_passed + np.arange(len(rays))
-        is_chosen = number % self._stride == self._stride // 2
-        order = np.argsort(rays.person, kind="stable")
-        _, start, count = np.unique(rays.person[order], return_index=True, return_counts=True)
-        has_none = ~np.logical_or.reduceat(is_chosen[order], start)
-        is_chosen[order[(start + count // 2)[has_none]]] = True
-        self._num_passed += len(rays)
-        rows = np.flatnonzero(is_chosen)
-        subset = rays.select(rows)
-        positions, facing = (
-            context.gaze_scene.transform_points(subset.origin),
-            context.gaze_scene.transform_directions(facing_directions(subset)),
-        )
-        self._poses.append(np.hstack([positions, facing]))
-        self._participants += [subset.persons[k] for k in subset.person.tolist()]
-        cells = context.cell_masks(subset, positions)
-        for k in range(len(rows)):
-            row_cells = frozenset(cell for cell, mask in cells if mask is None or mask[k])
-            self._cells.append(self._interned.setdefault(row_cells, row_cells))
-
-    def viewpoints(self) -> Viewpoints:
-        """Return all selected viewpoints."""
-        poses = np.concatenate(self._poses)
-        return Viewpoints(poses[:, :3], poses[:, 3:], tuple(self._participants), tuple(self._cells))

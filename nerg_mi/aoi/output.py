@@ -10,17 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.figures.statistics import aois_figure, transitions_figure
-from nerg_mi.figures.style import make_provenance, save
-from nerg_mi.files.atomic import replace_atomically, write_text
+from nerg_mi.figures.style import Provenance, save
+from nerg_mi.files.atomic import make_folder, replace_atomically, write_text
 from nerg_mi.files.dataframes import ResultTables
 from nerg_mi.files.tables import format_markdown_table, write_csv
-from nerg_mi.measures.tables import MEASURES, MEASURES_BY_NAME, PREDICTED, ParticipantRows, Row, format_measure
-from nerg_mi.measures.visits import VisitSums
-from nerg_mi.progress import Reporter
-from nerg_mi.rays.rays import import_pyarrow
+from nerg_mi.files.values import FilePath
+from nerg_mi.tracking.rays import import_pyarrow
 
-from .options import StatisticsOptions
+from .charts import aois_figure, transitions_figure
+from .tables import MEASURES, MEASURES_BY_NAME, PREDICTED, ParticipantRows, Row, format_measure
+from .visits import VisitSums
 
 # ---- Tables ----
 
@@ -222,7 +221,7 @@ _COLUMNS = {"aois": aoi_columns, "differences": difference_columns, "what_if": w
 
 @dataclass(frozen=True, eq=False, repr=False)
 class StatisticsResult(ResultTables):
-    """Attention statistics: tables as lists of dicts, and the files that were written.
+    """Attention statistics: tables as lists of dicts.
 
     Parameters
     ----------
@@ -244,8 +243,8 @@ class StatisticsResult(ResultTables):
         Sums that the tables were computed from.
     num_suppressed
         Number of values that were suppressed because they rest on too few participants.
-    files
-        Written files.
+    provenance
+        Origin of the tables.
     """
 
     TABLES = ("aois", "differences", "power", "transitions", "durations", "participants", "what_if")
@@ -259,50 +258,35 @@ class StatisticsResult(ResultTables):
     what_if: list[Row] = field(default_factory=list)
     sums: VisitSums | None = None
     num_suppressed: int = 0
-    files: list[Path] = field(default_factory=list)
+    provenance: Provenance = field(default_factory=lambda: Provenance("nerg stats"))
 
-
-def write_results(
-    folder: Path, result: StatisticsResult, inputs: Sequence[Path], options: StatisticsOptions, reporter: Reporter
-) -> list[Path]:
-    """Write the non-empty tables, their figures and the provenance to ``folder``. Return the paths."""
-    metadata = make_provenance("nerg stats", inputs, options.seed, options)
-    files: list[Path] = []
-    tables: dict[str, Sequence[Row]] = {
-        "aois": result.aois,
-        "differences": result.differences,
-        "power": result.power,
-        "transitions": result.transitions,
-        "durations": result.durations,
-        "participants": result.participants,
-        "what_if": result.what_if,
-    }
-    for name, rows in tables.items():
-        if rows:
-            columns = _COLUMNS.get(name, all_columns)(rows)
-            files += write_rows(folder, name, rows, *columns)
-    if result.aois:
-        first_cell = [r for r in result.aois if r["cell"] == result.aois[0]["cell"]]
-        save(aois_figure(first_cell), folder / "aois.png", metadata)
-        files.append(folder / "aois.png")
-    if result.sums is not None and result.transitions:
-        counts = {
-            (r["from"], r["to"]): r["transitions"]
-            for r in result.transitions
-            if r["cell"] == "all" and r["transitions"] is not None
-        }
-        names = [n for n in result.sums.areas if any(n in pair for pair in counts)]
-        if 1 < len(names) <= MAX_MATRIX_AREAS:
-            matrix = np.array([[counts.get((a, b), 0) for b in names] for a in names], float)
-            save(transitions_figure(names, matrix), folder / "transitions.png", metadata)
-            files.append(folder / "transitions.png")
-    write_text(folder / "about.json", metadata.json() + "\n")
-    files.append(folder / "about.json")
-    if not has_parquet():
-        reporter.message("no Parquet files were written, because pyarrow is missing: pip install 'nerg-mi[parquet]'")
-    reporter.message(f"wrote {len(files)} files to {folder}: {', '.join(p.name for p in files if p.suffix == '.md')}")
-    if result.num_suppressed:
-        text = f"{result.num_suppressed} values are suppressed, because they rest on too few participants\n"
-        write_text(folder / "suppressed.txt", text)
-        files.append(folder / "suppressed.txt")
-    return files
+    def save(self, folder: FilePath) -> list[Path]:
+        """Write the non-empty tables (CSV, Markdown and, with pyarrow, Parquet), their figures and the provenance to a
+        folder, which is created. Return the files."""
+        folder, files = make_folder(Path(folder)), list[Path]()
+        for name in self.TABLES:
+            if rows := getattr(self, name):
+                columns = _COLUMNS.get(name, all_columns)(rows)
+                files += write_rows(folder, name, rows, *columns)
+        if self.aois:
+            first_cell = [r for r in self.aois if r["cell"] == self.aois[0]["cell"]]
+            save(aois_figure(first_cell), folder / "aois.png", self.provenance)
+            files.append(folder / "aois.png")
+        if self.sums is not None and self.transitions:
+            counts = {
+                (r["from"], r["to"]): r["transitions"]
+                for r in self.transitions
+                if r["cell"] == "all" and r["transitions"] is not None
+            }
+            names = [n for n in self.sums.areas if any(n in pair for pair in counts)]
+            if 1 < len(names) <= MAX_MATRIX_AREAS:
+                matrix = np.array([[counts.get((a, b), 0) for b in names] for a in names], float)
+                save(transitions_figure(names, matrix), folder / "transitions.png", self.provenance)
+                files.append(folder / "transitions.png")
+        write_text(folder / "about.json", self.provenance.json() + "\n")
+        files.append(folder / "about.json")
+        if self.num_suppressed:
+            text = f"{self.num_suppressed} values are suppressed, because they rest on too few participants\n"
+            write_text(folder / "suppressed.txt", text)
+            files.append(folder / "suppressed.txt")
+        return files

@@ -5,29 +5,23 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from pathlib import Path
-from types import ModuleType
 from zlib import crc32
 
 import numpy as np
 
-from nerg_mi.alignment.check import read_similarity
 from nerg_mi.errors import NergError, parameter
 from nerg_mi.files.tables import join_reasons
-from nerg_mi.formats.areas import AreaGroup, AreaSet, read_regions
-from nerg_mi.formats.meshes import MeshFile
-from nerg_mi.measures.estimates import adjust_p_values, estimate_ratio_differences
-from nerg_mi.measures.shares import (
-    COARSE,
-    SamplePoints,
-    VisibilityCache,
-    compute_visibility,
-    find_standing_positions,
-    gaze_shares,
-    visible_in_fov,
-)
-from nerg_mi.measures.tables import (
+from nerg_mi.progress import SILENT, Reporter
+from nerg_mi.tracking.rays import Rays
+
+from .areas import Areas
+from .changes import Changes, apply_changes
+from .estimates import adjust_p_values, estimate_ratio_differences
+from .measured import AoiContext, facing_directions
+from .placed import PlacedAreas
+from .settings import ObserverGrid
+from .shares import COARSE, SamplePoints, compute_visibility, find_standing_positions, gaze_shares, visible_in_fov
+from .tables import (
     MEASURES_BY_NAME,
     MIN_VIEWPOINTS,
     PREDICTED,
@@ -36,24 +30,59 @@ from nerg_mi.measures.tables import (
     Row,
     explain_difference,
 )
-from nerg_mi.measures.visits import ALL, Aoi, Cell
-from nerg_mi.progress import SILENT, Reporter
-from nerg_mi.tracking_kinds import TRACKING_NOTES
+from .visits import ALL, Cell
 
-from .measured import AoiContext, TimeWindow, Viewpoints
-from .options import AoiOptions, CountOptions, PredictionOptions, parse_window
-from .scene import (
-    Changes,
-    GazeScene,
-    apply_to_areas,
-    apply_to_scene,
-    load_gaze_scene,
-    make_aois,
-    read_changes,
-    read_cohorts,
-    read_meshes,
-    shapes_by_id,
-)
+# ---- Viewpoints ----
+
+
+@dataclass(frozen=True, eq=False)
+class Viewpoints:
+    """E viewpoints in the scene: ``positions`` and ``facing`` directions (E, 3), names of their participants, and
+    the cells that each belongs to."""
+
+    positions: np.ndarray
+    facing: np.ndarray
+    participants: tuple[str, ...]
+    cells: tuple[frozenset[Cell], ...]
+
+
+class ViewpointSampler:
+    """Selects every n-th sample of a stream as a viewpoint, and at least one per block for each participant."""
+
+    def __init__(self, stride: int):
+        self._stride, self._num_passed = max(1, stride), 0
+        self._poses: list[np.ndarray] = [np.zeros((0, 6))]
+        self._participants: list[str] = []
+        self._cells: list[frozenset[Cell]] = []
+        self._interned: dict[frozenset[Cell], frozenset[Cell]] = {}
+
+    def add(self, rays: Rays, context: AoiContext) -> None:
+        """Select viewpoints from a block."""
+        number = self._num_passed + np.arange(len(rays))
+        is_chosen = number % self._stride == self._stride // 2
+        order = np.argsort(rays.person, kind="stable")
+        _, start, count = np.unique(rays.person[order], return_index=True, return_counts=True)
+        has_none = ~np.logical_or.reduceat(is_chosen[order], start)
+        is_chosen[order[(start + count // 2)[has_none]]] = True
+        self._num_passed += len(rays)
+        rows = np.flatnonzero(is_chosen)
+        subset = rays.select(rows)
+        positions, facing = (
+            context.placed.environment.points_to_field(subset.origin),
+            context.placed.environment.directions_to_field(facing_directions(subset)),
+        )
+        self._poses.append(np.hstack([positions, facing]))
+        self._participants += [subset.persons[k] for k in subset.person.tolist()]
+        cells = context.cell_masks(subset, positions)
+        for k in range(len(rows)):
+            row_cells = frozenset(cell for cell, mask in cells if mask is None or mask[k])
+            self._cells.append(self._interned.setdefault(row_cells, row_cells))
+
+    def viewpoints(self) -> Viewpoints:
+        """Return all selected viewpoints."""
+        poses = np.concatenate(self._poses)
+        return Viewpoints(poses[:, :3], poses[:, 3:], tuple(self._participants), tuple(self._cells))
+
 
 # ---- Prediction ----
 #
@@ -112,61 +141,35 @@ def subsample_participants(viewpoints: Viewpoints, max_participants: int, report
 
 
 def predict_attention(
-    gaze_scene: GazeScene,
-    viewpoints: Viewpoints,
-    aois: Sequence[Aoi],
-    members: Sequence[tuple[int, ...]],
-    margin: float,
-    fov: float,
-    num_points: int,
-    num_directions: int,
-    reporter: Reporter,
+    placed: PlacedAreas, viewpoints: Viewpoints, fov: float, reporter: Reporter = SILENT
 ) -> PredictedAttention:
-    """Predict the attention of viewpoints on areas with the gaze field of a scene.
+    """Predict the attention of E viewpoints on areas, with a field of view of ``fov`` degrees. Requires a gaze field.
 
-    Parameters
-    ----------
-    gaze_scene
-        Scene with a gaze field.
-    viewpoints
-        E viewpoints.
-    aois
-        Elementary AOIs.
-    members
-        Indices into ``aois`` of each of A areas.
-    margin
-        Surface tolerance in scene units.
-    fov
-        Angle of the field of view in degrees.
-    num_points
-        Number of sample points per AOI, for visibility.
-    num_directions
-        Initial number of directions around a viewpoint; small areas use more.
-    reporter
-        Reports progress.
+    Small areas use more directions than those of ``placed.sampling``.
     """
-    E = len(viewpoints.positions)
+    assert placed.sampler is not None
+    E, sampling = len(viewpoints.positions), placed.sampling
     on_progress = lambda done: reporter.progress(done / E, f"prediction: viewpoint {done} of {E}")
     shares = gaze_shares(
-        gaze_scene.query_from,
+        placed.sampler.query_from,
         viewpoints.positions,
-        aois,
-        members,
-        margin,
-        replace(COARSE, initial_directions=num_directions),
+        placed.aois,
+        placed.members,
+        placed.margin,
+        replace(COARSE, initial_directions=sampling.directions),
         on_progress,
     )
-    targets = SamplePoints.sample(aois, num_points)
+    targets = SamplePoints.sample(placed.aois, sampling.aoi_samples)
     in_fov = visible_in_fov(
         targets,
         viewpoints.positions,
         viewpoints.facing,
-        compute_visibility(targets, viewpoints.positions, gaze_scene.trace_depth, margin),
+        compute_visibility(targets, viewpoints.positions, placed.environment.trace_depth, placed.margin),
         fov,
     )
-    visible = np.stack([in_fov[:, list(indices)].any(axis=1) for indices in members], axis=1)
-    support = np.array([gaze_scene.support_at(p) for p in viewpoints.positions])
-    return PredictedAttention(shares.share, shares.distance / gaze_scene.scale, visible, support, shares.members)
+    visible = np.stack([in_fov[:, list(indices)].any(axis=1) for indices in placed.members], axis=1)
+    support = np.array([placed.sampler.support_at(p) for p in viewpoints.positions])
+    return PredictedAttention(shares.share, shares.distance / placed.scale, visible, support, shares.members)
 
 
 def aggregate_by_participant(
@@ -216,16 +219,20 @@ def aggregate_by_participant(
 # ---- Observers without recordings ----
 
 
-def place_observers_on_floor(gaze_scene: GazeScene, height: float, step: float, floor: float) -> np.ndarray:
-    """Return standing positions (G, 3) at eye ``height`` on a grid. Raises `NergError` if there are none."""
-    lower, upper = gaze_scene.bounds()
-    positions = find_standing_positions(
-        lower, upper, step * gaze_scene.scale, height * gaze_scene.scale, gaze_scene.trace_depth, floor
-    )
+def place_observers_on_floor(placed: PlacedAreas, grid: ObserverGrid) -> np.ndarray:
+    """Return standing positions (G, 3) on a grid. Raises `NergError` if there are none."""
+    environment, scale = placed.environment, placed.scale
+    bounds = environment.scene_geometry.bounds()
+    if bounds is None:
+        raise NergError("the bounds of the scene are unknown; give a scene or a radiance field")
+    lower, upper = (np.array(corner, float) for corner in bounds)
+    step, height = grid.grid_step * scale, grid.eye_height * scale
+    positions = find_standing_positions(lower, upper, step, height, environment.trace_depth, grid.floor_height)
     if not len(positions):
         raise NergError(
-            f"no walkable floor was found at height {floor:g} ({parameter('floor_height')}) below eyes at "
-            f"{height:g} ({parameter('eye_height')}); correct one of them"
+            f"no walkable floor was found at height {grid.floor_height:g} ({parameter('floor_height')}) below eyes at "
+            f"{grid.eye_height:g} ({parameter('eye_height')}); correct one of them, or give "
+            f"{parameter('observers')}"
         )
     return positions
 
@@ -234,148 +241,6 @@ def viewpoints_at(positions: np.ndarray) -> Viewpoints:
     """Return a viewpoint of a separate observer, who may face any direction, at each of ``positions`` (M, 3)."""
     names = tuple(f"observer {k + 1:0{len(str(len(positions)))}d}" for k in range(len(positions)))
     return Viewpoints(positions, np.tile([1.0, 0, 0], (len(positions), 1)), names, (frozenset([ALL]),) * len(positions))
-
-
-# ---- AOI scene ----
-
-
-@dataclass(frozen=True, eq=False)
-class AoiScene:
-    """Areas of interest in a scene.
-
-    Parameters
-    ----------
-    gaze_scene
-        Surfaces and gaze field.
-    areas
-        Areas.
-    aois
-        Elementary AOIs of the areas.
-    options
-        Options of the measurement (`CountOptions`), of the prediction (`PredictionOptions`), or of both.
-    meshes
-        Meshes of AOIs and changes, by file.
-    alignment_doubts
-        Messages about an alignment that its evidence did not determine.
-    """
-
-    gaze_scene: GazeScene
-    areas: AreaSet
-    aois: Sequence[Aoi]
-    options: AoiOptions
-    meshes: Mapping[Path, MeshFile]
-    alignment_doubts: tuple[str, ...] = ()
-
-    @property
-    def warnings(self) -> list[str]:
-        """Warnings about the alignment, about a gaze field of heads, and about unused content of the meshes."""
-        gaze = self.gaze_scene.gaze
-        basis = None if gaze is None else gaze.field.basis
-        note = None if basis is None else TRACKING_NOTES.get(basis.tracking)
-        of_heads = f"the gaze field was trained on {note}: predictions are those of heads, not of eyes"
-        return [
-            *self.alignment_doubts,
-            *([of_heads] if note else []),
-            *(f"of {file}: {note}" for file, mesh in self.meshes.items() for note in mesh.notes),
-        ]
-
-    @cached_property
-    def members(self) -> list[tuple[int, ...]]:
-        """Indices of the elementary AOIs of each area."""
-        return list(self.areas.element_indices().values())
-
-    @property
-    def margin(self) -> float:
-        """Surface tolerance in scene units."""
-        return self.options.margin * self.gaze_scene.scale
-
-    def make_context(self, use_hit_points: bool, cohorts: tuple[str, ...]) -> AoiContext:
-        """Create the context for measured samples; ``cohorts`` are those of the samples if no table defines cohorts."""
-        o = self.options
-        assert isinstance(o, CountOptions)
-        visibility_cache = None
-        if o.aoi_visibility:
-            targets = SamplePoints.sample(self.aois, o.aoi_samples)
-            visibility_cache = VisibilityCache(
-                targets, self._trace_depth, o.cell_size * self.gaze_scene.scale, self.margin
-            )
-        leaves = [k for k, area in enumerate(self.areas.areas) if not isinstance(area, AreaGroup)]
-        cohort_of = {} if o.cohorts is None else read_cohorts(o.cohorts)
-        return AoiContext(
-            self.gaze_scene,
-            self.aois,
-            self.areas.names,
-            self.members,
-            leaves,
-            o.visit_rules(),
-            self.margin,
-            o.tolerance,
-            use_hit_points,
-            o.fov,
-            visibility_cache,
-            [TimeWindow(*parse_window(text)) for text in o.windows],
-            [] if o.zones is None else read_regions(o.zones),
-            cohort_of,
-            tuple(sorted(set(cohort_of.values()))) if cohort_of else cohorts,
-        )
-
-    def apply_changes(self, changes: Changes) -> AoiScene:
-        """Return the scene after ``changes`` of shapes and areas. Raises `NergError` for invalid changes."""
-        areas, gaze_scene, shapes = (
-            apply_to_areas(self.areas, changes),
-            self.gaze_scene,
-            shapes_by_id(self.gaze_scene.scene),
-        )
-        meshes = {**self.meshes, **read_meshes(file for file in changes.meshes if file not in self.meshes)}
-        if changes.changes_shapes:
-            scene, shapes = apply_to_scene(gaze_scene.scene, changes, meshes)
-            gaze_scene = gaze_scene.with_scene(scene)
-        aois = make_aois(areas.elements, shapes, meshes, gaze_scene.scene)
-        return replace(self, gaze_scene=gaze_scene, areas=areas, aois=aois, meshes=meshes)
-
-    def predict(self, viewpoints: Viewpoints, fov: float, reporter: Reporter = SILENT) -> PredictedAttention:
-        """Predict the attention of ``viewpoints`` with a field of view of ``fov`` degrees."""
-        o = self.options
-        assert isinstance(o, PredictionOptions)
-        return predict_attention(
-            self.gaze_scene,
-            viewpoints,
-            self.aois,
-            self.members,
-            self.margin,
-            fov,
-            o.aoi_samples,
-            o.directions,
-            reporter,
-        )
-
-    def _trace_depth(self, o: np.ndarray, d: np.ndarray) -> np.ndarray:
-        """Return the distance to the surfaces of the scene or, if they are unknown, to the nearest AOI."""
-        if self.gaze_scene.geometry is not None:
-            return self.gaze_scene.trace_depth(o, d)
-        depth = np.full(len(o), np.inf)
-        for aoi in self.aois:
-            near, far = aoi.intersect(o, d)
-            is_hit = (near >= 0) & (np.isfinite(near) if aoi.is_surface else near < far)
-            depth = np.where(is_hit, np.minimum(depth, near), depth)
-        return depth
-
-
-def load_aoi_scene(
-    scene: Path | None, field: Path | None, gaze: Path | None, areas: AreaSet, options: AoiOptions, ns: ModuleType
-) -> AoiScene:
-    """Load the AOI scene from files. Raises `NergError`; options are checked before any file is loaded."""
-    if isinstance(options, CountOptions):
-        # Fail before files are read.
-        options.visit_rules()
-    doubts: list[str] = []
-    align = None
-    if options.align is not None:
-        align = read_similarity(options.align, parameter("align"), "rays to scene", doubts.append)
-    gaze_scene = load_gaze_scene(scene, field, gaze, align, ns)
-    meshes = read_meshes(areas.meshes)
-    aois = make_aois(areas.elements, shapes_by_id(gaze_scene.scene), meshes, gaze_scene.scene)
-    return AoiScene(gaze_scene, areas, aois, options, meshes, tuple(doubts))
 
 
 # ---- Uncertainty ----
@@ -492,12 +357,12 @@ def _spreads(
 
 # ---- What-if table ----
 
-Predict = Callable[[AoiScene, Viewpoints], PredictedAttention]
+Predict = Callable[[PlacedAreas, Viewpoints], PredictedAttention]
 
 
 def what_if_rows(
-    path: Path,
-    aoi_scene: AoiScene,
+    changes: Changes,
+    placed: PlacedAreas,
     viewpoints: Viewpoints,
     before: PredictedAttention,
     predict: Predict,
@@ -505,7 +370,7 @@ def what_if_rows(
     resamples: int,
     seed: int,
 ) -> list[Row]:
-    """Compare predictions before and after the changes in the file ``path``.
+    """Compare predictions before and after ``changes``.
 
     Each row has an area, a measure (``share`` of gaze or ``visible`` share of time), the values ``before`` and
     ``after``, the ``difference`` with its interval over participants, the standard deviation of the difference over
@@ -513,29 +378,27 @@ def what_if_rows(
 
     Parameters
     ----------
-    path
-        File of changes.
-    aoi_scene
-        Scene before the changes.
+    changes
+        Changes.
+    placed
+        Areas before the changes.
     viewpoints, before
         Viewpoints and their prediction before the changes.
     predict
-        Predicts the attention of viewpoints in the changed scene.
+        Predicts the attention of viewpoints after the changes.
     min_participants
         Suppresses values of few participants.
     resamples, seed
         Number and seed of the bootstrap draws.
     """
-    changes = read_changes(path)
-    changed_scene = aoi_scene.apply_changes(changes)
-    areas, after_areas = aoi_scene.areas, changed_scene.areas
+    changed = apply_changes(placed, changes)
+    areas, after_areas = placed.areas, changed.areas
     changed_viewpoints = viewpoints
     if changes.observers is not None:
         changed_viewpoints = viewpoints_at(changes.observers)
     if changes.shift is not None:
         changed_viewpoints = replace(changed_viewpoints, positions=changed_viewpoints.positions + changes.shift)
-    after = predict(changed_scene, changed_viewpoints)
-    after = replace(after, note=changed_scene.gaze_scene.describe_extrapolation(changed_viewpoints.positions))
+    after = predict(changed, changed_viewpoints)
     # Participants with viewpoints before and after the changes are paired.
     names = sorted({*viewpoints.participants, *changed_viewpoints.participants})
     support = median_support(after)
@@ -566,7 +429,7 @@ def what_if_rows(
 
 
 def _mean_by_participant(
-    viewpoints: Viewpoints, names: list[str], values: np.ndarray, areas: AreaSet, name: str
+    viewpoints: Viewpoints, names: list[str], values: np.ndarray, areas: Areas, name: str
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the mean of an area's ``values`` (E, A) over the viewpoints of each participant, and whether the
     participant has viewpoints, (P, 1) each."""

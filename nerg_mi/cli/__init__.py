@@ -1,6 +1,19 @@
 """The command ``nerg``: finds and runs the sub-command, and reports errors of the user in one sentence.
 
-Commands are declared in the modules of their workflows (`nerg_mi.workflows.base`), and built by `.building`.
+Commands are rows of `.table`, and built by `.building`. Python functions have the same options, with underscores
+instead of dashes, and more that only experts set. ``nerg --version`` prints the version. ``--debug``, anywhere on the
+line (or ``NERG_TRACEBACK=1``), prints the traceback of an error.
+
+Exit codes: 0 success; 1 an error that the user can fix, in one sentence; 2 a wrong command line; 70 a bug in the
+program; 130 after Ctrl-C.
+
+Completion in bash, zsh or fish: ``nerg --install-completion`` writes a script for the shell and a line into its
+configuration; ``nerg --show-completion`` prints them. ``_NERG_COMPLETE=source_bash nerg`` (``source_zsh``,
+``source_fish``) prints the script of one shell.
+
+Commands that open network connections: those with ``--scheduler tcp://...`` or ``tls://...`` connect to a Dask
+cluster and send the job's inputs, recordings included, to its workers; ``nerg worker`` connects to a scheduler and
+runs what it is sent; ``nerg view`` listens on a port.
 """
 
 from __future__ import annotations

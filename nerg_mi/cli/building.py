@@ -19,22 +19,23 @@ import typer
 import typer.core
 
 from nerg_mi import __version__
-from nerg_mi.errors import Spelling, clean_text, parameter, sanitize, spell_command_line
+from nerg_mi.errors import Spelling, clean_text, parameter, sanitize, spell_command_line, spell_python
 from nerg_mi.options import GROUPS as GROUPS_OF_OPTIONS
 from nerg_mi.progress import TerminalReporter
 from nerg_mi.ranges import KAPPAS, RANGE
-from nerg_mi.workflows.base import COMMANDS, Command, HelpView, Parameter
 
+from .declarations import COMMANDS, Command, HelpView, Parameter
 from .ending import shorten_values
 from .signatures import make_command
 from .table import ROWS, TABLE
 
-PACKAGES = ("nerg_mi.workflows", "nerg_mi.viewer", "nerg_mi.cli")
+PACKAGES = ("nerg_mi.cli",)
 """Packages whose modules and submodules may declare commands."""
 
 GROUPS = {
     "rays": "Import tracking files as gaze rays, and check, filter, split and plot them.",
     "train": "Train a radiance field on posed photos, or a gaze field on gaze rays.",
+    "draw": "Draw a figure: a gaze sphere, occlusion, a floor plan, a contact sheet, a difference, a baked surface.",
     "eval": "Score a radiance field on held-out views, or a gaze field on held-out rays.",
     "export": "Export a radiance field as a mesh, points, Gaussian splats, grid volumes or a torch-ngp checkpoint.",
 }
@@ -257,11 +258,11 @@ def make_callback(command: Command) -> Callable[..., None]:
     """
     kind = command.options
     every = {} if kind is None else {f.name: f for f in fields(kind)}
-    more = {**command.parameters, **(command.further() if command.further else {})}
+    more = command.parameters
     shown = {name: f for name, f in every.items() if name not in more and name not in command.without}
     parameters = {name: _parameter(name, p) for name, p in more.items()}
     parameters |= {name: _option(f, get_type_hints(kind)[name]) for name, f in shown.items()}
-    spelling = _make_spelling(parameters)
+    spelling = _make_spelling(parameters, command.without)
 
     def call(**values: Any) -> None:
         if kind is not None:
@@ -281,15 +282,17 @@ def make_callback(command: Command) -> Callable[..., None]:
 _FLAGS = {
     "columns": "--map",
     "defaults": "--define",
-    "environment": "--field",
     "handedness": "--hand",
     "observers": "--observer",
     "persons": "--person",
 }
 
 
-def _make_spelling(parameters: Mapping[str, inspect.Parameter]) -> Spelling:
-    """Return the spelling of ``parameters`` in messages: options by their flags, and arguments in capital letters."""
+def _make_spelling(parameters: Mapping[str, inspect.Parameter], without: Sequence[str] = ()) -> Spelling:
+    """Return the spelling of ``parameters`` in messages: options by their flags, and arguments in capital letters.
+
+    Those that the command is ``without`` are spelled as in Python.
+    """
     flags = dict(_FLAGS)
     for name, declared in parameters.items():
         (info,) = declared.annotation.__metadata__
@@ -301,6 +304,8 @@ def _make_spelling(parameters: Mapping[str, inspect.Parameter]) -> Spelling:
             flags[name] = info.metavar or name.upper()
 
     def spell(name: str, value: str) -> str:
+        if name in without:
+            return spell_python(name, value)
         flag = flags.get(name, "")
         return spell_command_line(name, value, flag) if flag.startswith("-") or not flag else flag
 
@@ -309,9 +314,10 @@ def _make_spelling(parameters: Mapping[str, inspect.Parameter]) -> Spelling:
 
 def choose_spelling(arguments: Sequence[str]) -> Spelling:
     """Return the spelling of parameters in messages of the command that ``arguments`` call."""
-    for name, command in COMMANDS.items():
+    for name in (*COMMANDS, *ROWS):
         words = name.split()
         if words == list(arguments[: len(words)]):
+            command = COMMANDS[name] if name in COMMANDS else make_command(ROWS[name])
             return make_callback(command).__dict__["spelling"]
     return _make_spelling({})
 
@@ -333,7 +339,7 @@ def _option(field: Field, hint: Any) -> inspect.Parameter:
         hint, default = str | None, None if default is None else f"{default:g}"
         more, is_parsed = more | {"metavar": "<number or angle>"}, True
     elif is_parsed:
-        hint = list[str] | None if any(get_origin(kind) is Mapping for kind in get_args(hint)) else str | None
+        hint = list[str] | None if any(_is_of_several(kind) for kind in get_args(hint)) else str | None
     elif get_origin(hint) is tuple:
         hint, default = list[get_args(hint)[0]] | None, None
     elif Path in get_args(hint):
@@ -348,6 +354,11 @@ def _option(field: Field, hint: Any) -> inspect.Parameter:
 
 def _keyword(name: str, hint: Any, default: Any, info: Any) -> inspect.Parameter:
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[hint, info])
+
+
+def _is_of_several(kind: Any) -> bool:
+    """Whether a parsed option with values of this ``kind``, a mapping or a tuple of points, is repeated."""
+    return get_origin(kind) is Mapping or (get_origin(kind) is tuple and get_origin(get_args(kind)[0]) is tuple)
 
 
 def _is_repeatable(hint: Any) -> bool:

@@ -1,1 +1,2 @@
-"""Environments that participants see: trained fields, splats, meshes, scenes and hit points."""
+"""Environments that participants see (trained fields, splats, meshes, scenes, hit points), the Mitsuba scenes that show
+them, and their rendering."""

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 from nerg_mi.errors import NergError, clean_text, parameter, translate_mitsuba_errors
 from nerg_mi.fields.splats import Splats
 from nerg_mi.files.atomic import check_writable, make_folder, replace_atomically, write_text
+from nerg_mi.files.html import Summary
 from nerg_mi.files.names import make_portable_name
 from nerg_mi.files.values import to_numbers
 from nerg_mi.formats.meshes import MeshFile, read_mesh_file, with_shading_normals
@@ -27,8 +28,9 @@ from nerg_mi.formats.surfaces import write_volume
 from nerg_mi.maths.color import decode_srgb
 from nerg_mi.properties import resolve_scene_file
 from nerg_mi.registration import PLUGINS, get_plugin_class
-from nerg_mi.rendering.files import check_mesh, write_mesh
-from nerg_mi.rendering.scene_writer import (
+
+from .rendering_files import check_mesh, read_vol, write_mesh
+from .scene_writer import (
     Element,
     Node,
     check_attribute,
@@ -40,7 +42,6 @@ from nerg_mi.rendering.scene_writer import (
     relative_path,
     transform,
 )
-
 from .trained import TrainedField
 
 if TYPE_CHECKING:
@@ -49,8 +50,8 @@ if TYPE_CHECKING:
 # ---- Grids of densities ----
 
 
-@dataclass(frozen=True, eq=False)
-class DensityGrid:
+@dataclass(frozen=True, eq=False, repr=False)
+class DensityGrid(Summary):
     """An environment as a grid of densities.
 
     Parameters
@@ -106,6 +107,15 @@ class DensityGrid:
         z, y, x = np.shape(self.density)
         lower, upper = (", ".join(f"{v:.4g}" for v in np.asarray(c).tolist()) for c in (self.lower, self.upper))
         return f"<DensityGrid: {x} x {y} x {z} cells, box ({lower}) to ({upper})>"
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], color: str | os.PathLike[str] | None = None) -> DensityGrid:
+        """Load a density, and the ``color`` of another file, from grid volumes of Mitsuba (.vol), as `save` writes
+        them. Raises `NergError` for other files."""
+        values, lower, upper = read_vol(path)
+        if values.shape[-1] != 1:
+            raise NergError(f'"{path}" has {values.shape[-1]} channels and is no density')
+        return cls(values[..., 0], lower, upper, None if color is None else read_vol(color)[0])
 
     def save(self, path: str | os.PathLike[str], color: str | os.PathLike[str] | None = None) -> None:
         """Write the density to ``path``, and the colour to ``color``, as grid volumes of Mitsuba (.vol).
@@ -179,9 +189,9 @@ class FieldVolume:
         if isinstance(self.field, (str, os.PathLike)):
             return self._describe(Path(self.field))
         volume = get_plugin_class(self.plugin)
-        if isinstance(self.field, TrainedField):
-            return volume.from_network(self.field.network, self.to_world, self.field.name)
-        return volume.from_network(self.field, self.to_world)
+        if isinstance(self.field, Splats):
+            return volume.from_network(self.field, self.to_world)
+        return volume.from_network(self.field.network, self.to_world, self.field.name)
 
     def place(self, path: Path) -> dict[str, Any]:
         """Write the field to ``path``, unless it is a file, and return the volume as a dict."""
@@ -193,7 +203,7 @@ class FieldVolume:
         if isinstance(field, Splats):
             write_ply_splats(path, field)
         else:
-            (field if isinstance(field, TrainedField) else TrainedField(field)).save(path)
+            field.save(path)
         return self._describe(path)
 
     def _describe(self, path: Path) -> dict[str, Any]:
@@ -345,7 +355,7 @@ def _list_children(shapes: object, name: str) -> list[tuple[str, Any]]:
     if isinstance(shapes, (str, os.PathLike)):
         if Path(shapes).suffix.lower() != ".xml":
             return [(name, load_mesh_child(shapes))]
-        from nerg_mi.rendering.scene import load_scene
+        from .scene_loading import load_scene
 
         return _list_scene_children(load_scene(Path(shapes)), name)
     if is_trimesh(shapes):

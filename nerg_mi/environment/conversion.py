@@ -7,9 +7,9 @@ from dataclasses import replace
 from typing import Annotated, Literal, NamedTuple
 
 from nerg_mi.errors import NergError, parameter
-from nerg_mi.fields.gaze_base import AnyGazeField
 from nerg_mi.fields.occupancy import refine_occupancy
-from nerg_mi.fields.radiance import RadianceField
+from nerg_mi.fields.radiance import RadianceNetwork
+from nerg_mi.files.html import summary_table
 from nerg_mi.files.values import FilePath, to_path
 from nerg_mi.formats.splats import SurfaceSplats, make_splats
 from nerg_mi.formats.surfaces import Surface, extract_mesh, extract_points, sample_density_and_color
@@ -24,10 +24,11 @@ from nerg_mi.formats.torch_ngp import (
 )
 from nerg_mi.progress import Progress, Reporter, open_reporter
 from nerg_mi.ranges import POSITIVE_VALUES, Range, check_ranges
-from nerg_mi.rendering.scene import get_array_module
 
 from .contents import DensityGrid
-from .trained import TrainedField, open_field
+from .gaze import GazeField
+from .radiance import RadianceField
+from .scene_loading import get_array_module
 
 # ---- Import ----
 
@@ -37,14 +38,17 @@ class ImportedFields(NamedTuple):
 
     Attributes
     ----------
-    field : TrainedField or None
+    field : RadianceField or None
         The radiance field.
-    gaze : TrainedField or None
-        The gaze field; `load_gaze` loads it from its file with the methods of trained ones, such as ``density``.
+    gaze : GazeField or None
+        The gaze field.
     """
 
-    field: TrainedField[RadianceField] | None
-    gaze: TrainedField[AnyGazeField] | None
+    field: RadianceField | None
+    gaze: GazeField | None
+
+    def _repr_html_(self) -> str:
+        return summary_table(self._asdict())
 
     def save(self, output: FilePath | None = None, gaze: FilePath | None = None) -> None:
         """Write the radiance field to ``output`` and the gaze field to ``gaze`` (.safetensors); None writes none.
@@ -133,12 +137,12 @@ def import_checkpoint(
                 f"{parameter('gaze', 'NAME.safetensors')}"
             )
     return ImportedFields(
-        None if field is None else TrainedField(field, origin, path.name, half=half),
-        None if gaze is None else TrainedField(gaze, origin, path.name, half=half),
+        None if field is None else RadianceField(field, origin, path.name, half=half),
+        None if gaze is None else GazeField(gaze, origin, path.name, half=half),
     )
 
 
-def _describe_field(field: RadianceField, origin: dict) -> str:
+def _describe_field(field: RadianceNetwork, origin: dict) -> str:
     cells = "no occupancy grid (marching evaluates all of space)"
     if field.occupancy is not None:
         cells = f"{100 * field.occupancy.occupied_fraction:.1f} % of its box occupied"
@@ -151,9 +155,9 @@ def _describe_field(field: RadianceField, origin: dict) -> str:
 # Radiance fields in the formats of other tools, in the units of the field.
 
 
-def _open(field: TrainedField[RadianceField] | FilePath, reporter: Reporter) -> RadianceField:
+def _open(field: RadianceField | FilePath, reporter: Reporter) -> RadianceNetwork:
     reporter.progress(0.0, "reading the field")
-    trained = open_field(field)
+    trained = RadianceField.open(field)
     trained.network.require_density(f'"{trained.name}"')
     reporter.progress(0.01, "sampling the field")
     if trained.network.box.is_contracted:
@@ -163,12 +167,10 @@ def _open(field: TrainedField[RadianceField] | FilePath, reporter: Reporter) -> 
 
 @check_ranges
 def export_mesh(
-    field: TrainedField[RadianceField] | FilePath,
+    field: RadianceField | FilePath,
     *,
     resolution: Annotated[int, Range(2, 2048)] = 256,
     density_threshold: Annotated[float, POSITIVE_VALUES] | None = None,
-    fill_holes: Annotated[int, Range(0, 2048)] = 1,
-    min_component_area: Annotated[float, Range(0, 1)] = 0.001,
     keep_unseen: bool = False,
     up: Literal["z", "y"] = "z",
     progress: Progress = None,
@@ -177,16 +179,12 @@ def export_mesh(
 
     Parameters
     ----------
-    field : TrainedField or path
+    field : RadianceField or path
         Radiance field (.safetensors).
     resolution : int
         Number of grid cells along the longest edge of the field's bounding box.
     density_threshold : float, optional
         Density of the extracted surface in 1/unit. Default: absorbs half of the light across a grid cell.
-    fill_holes : int
-        Close holes of up to twice this number of grid cells; 0 closes none.
-    min_component_area : float
-        Smallest area of a connected component, as a fraction of the largest one; smaller components are removed.
     keep_unseen : bool
         Keep surfaces that no training view saw, such as backs and insides.
     up : str
@@ -215,9 +213,7 @@ def export_mesh(
     >>> mesh.save(folder / "store.ply")
     """
     with open_reporter(progress) as reporter:
-        mesh = extract_mesh(
-            _open(field, reporter), resolution, density_threshold, fill_holes, min_component_area, keep_unseen
-        )
+        mesh = extract_mesh(_open(field, reporter), resolution, density_threshold, keep_unseen=keep_unseen)
         r = mesh.report
         reporter.message(
             f"surface at a density of {r['threshold']:.4g} / unit, cells of {r['cell']:.4g} units ({_by(r['lattice'])})"
@@ -236,7 +232,7 @@ def export_mesh(
 
 @check_ranges
 def export_points(
-    field: TrainedField[RadianceField] | FilePath,
+    field: RadianceField | FilePath,
     *,
     resolution: Annotated[int, Range(2, 2048)] = 256,
     density_threshold: Annotated[float, POSITIVE_VALUES] | None = None,
@@ -248,7 +244,7 @@ def export_points(
 
     Parameters
     ----------
-    field : TrainedField or path
+    field : RadianceField or path
         Radiance field (.safetensors).
     resolution : int
         Number of grid cells along the longest edge of the field's bounding box.
@@ -287,7 +283,7 @@ def export_points(
 
 @check_ranges
 def export_splats(
-    field: TrainedField[RadianceField] | FilePath,
+    field: RadianceField | FilePath,
     *,
     resolution: Annotated[int, Range(2, 2048)] = 256,
     density_threshold: Annotated[float, POSITIVE_VALUES] | None = None,
@@ -297,7 +293,7 @@ def export_splats(
 
     Parameters
     ----------
-    field : TrainedField or path
+    field : RadianceField or path
         Radiance field (.safetensors).
     resolution : int
         Number of grid cells along the longest edge of the field's bounding box.
@@ -335,7 +331,7 @@ def export_splats(
 
 @check_ranges
 def export_volume(
-    field: TrainedField[RadianceField] | FilePath,
+    field: RadianceField | FilePath,
     *,
     resolution: Annotated[int, Range(2, 2048)] = 256,
     color: bool = False,
@@ -347,7 +343,7 @@ def export_volume(
 
     Parameters
     ----------
-    field : TrainedField or path
+    field : RadianceField or path
         Radiance field (.safetensors).
     resolution : int
         Number of grid cells along the longest edge of the field's bounding box.
@@ -381,12 +377,12 @@ def export_volume(
     return DensityGrid(density, lower, upper, colors)
 
 
-def export_torch_ngp(field: TrainedField[RadianceField] | FilePath, *, progress: Progress = None) -> TorchNgpModel:
+def export_torch_ngp(field: RadianceField | FilePath, *, progress: Progress = None) -> TorchNgpModel:
     """Convert a field to a torch-ngp checkpoint, if its grid and networks fit its layout.
 
     Parameters
     ----------
-    field : TrainedField or path
+    field : RadianceField or path
         Radiance field (.safetensors).
     progress : bool, Reporter or None
         Progress and messages (`nerg_mi.progress.Progress`).

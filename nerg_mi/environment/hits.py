@@ -8,9 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import NergError, parameter
+from nerg_mi.files.safe_read import translate_read_errors
 from nerg_mi.maths.geometry import Box, intersect_box_numpy
 from nerg_mi.ranges import LENGTHS, check_number
-from nerg_mi.rays.rays import Rays
+from nerg_mi.tracking.rays import Rays
+
+from .rendering_files import check_vol
 
 # ---- Hit extent ----
 #
@@ -270,6 +273,9 @@ def make_volume_dict(path: str | Path) -> dict:
 # walls and shelves are distinguishable.
 
 
+NO_DATA_GREY = 0.65
+"""Grey behind hit points, so that their gaps are not mistaken for dark surfaces."""
+
 # Linear grey of surfaces that face along ±x, ±y and ±z.
 _GREY = np.array([0.34, 0.16, 0.55])
 _CELL = 2
@@ -317,3 +323,21 @@ def shade_hits(density: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tup
     )
     edge = (np.asarray(upper) - lower) / shape[::-1]
     return np.repeat(grey[..., None], 3, axis=-1).astype(np.float32), lower + cells[::-1] * _CELL * edge
+
+
+def shade_hit_volume(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the colours (z, y, x, 3) of the hit-point volume ``path``, and the lower and upper corner of their box.
+
+    Raises `NergError` for other files.
+    """
+    check_vol(path)
+    with translate_read_errors(path, "volume of hit points"):
+        shape = np.fromfile(path, "<i4", 4, offset=8)
+        lower, upper = np.fromfile(path, "<f4", 6, offset=24).astype(float).reshape(2, 3)
+        density = np.fromfile(path, "<f4", int(np.prod(shape, dtype=np.int64)), offset=48)
+    if shape[3] != 1 or not (np.isfinite([lower, upper]).all() and (lower < upper).all()):
+        raise NergError(
+            f'"{path}" is not a volume of hit points; give one that "nerg train gaze --environment hits" has written'
+        )
+    color, end = shade_hits(density.reshape(shape[2], shape[1], shape[0]), lower, upper)
+    return color, lower, end

@@ -1,36 +1,37 @@
-"""Trained fields in memory, with their provenance."""
+"""Base of trained fields in memory, with their provenance."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from types import ModuleType
+from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nerg_mi.errors import NergError
-from nerg_mi.fields.gaze_base import AnyGazeField, tracking_suffix
-from nerg_mi.fields.radiance import RadianceField
-from nerg_mi.files.atomic import file_sha256
+from nerg_mi.fields.gaze_base import GazeNetwork, tracking_suffix
+from nerg_mi.fields.radiance import RadianceNetwork
 from nerg_mi.files.html import key_value_table
 from nerg_mi.files.values import FilePath, to_path
-from nerg_mi.formats.fields import load_radiance, save_gaze, save_radiance
-from nerg_mi.rendering.scene import get_array_module
 from nerg_mi.tracking_kinds import read_tracking
 
-Network = TypeVar("Network", RadianceField, AnyGazeField)
+from .scene_loading import get_array_module
+
+Network = TypeVar("Network", RadianceNetwork, GazeNetwork)
+Field = TypeVar("Field", bound="TrainedField[Any]")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class TrainedField(Generic[Network]):
-    """A radiance field or a gaze field in memory.
+    """A trained field in memory: base of `RadianceField` and `GazeField`.
 
     Attributes
     ----------
-    network : RadianceField or gaze field
-        The field (`nerg_mi.fields`). Its arrays belong to the variant that was active when it was created.
+    network : RadianceNetwork or GazeNetwork
+        The networks (`nerg_mi.fields`). Their arrays belong to the variant that was active when they were created.
     provenance : mapping
         Training data, options and scores, as stored in the file.
     name : str
@@ -51,15 +52,50 @@ class TrainedField(Generic[Network]):
     origin: str | None = field(default=None, kw_only=True)
     half: bool = field(default=False, kw_only=True)
 
-    def derive(self, network: Network, **provenance: Any) -> TrainedField[Network]:
-        """Return a field with the weights of this one that is compiled or refined, with more ``provenance``."""
-        origin = self.origin or (None if self.path is None else file_sha256(self.path))
-        return TrainedField(network, {**self.provenance, **provenance}, origin=origin, half=self.half)
+    kind: ClassVar[str]
+    """``radiance`` or ``gaze``."""
+
+    @classmethod
+    def load(cls: type[Field], path: FilePath) -> Field:
+        """Load a checkpoint. Raises `NergError` if it does not exist, is damaged, or contains something else."""
+        path = to_path(path)
+        network, metadata = cls._read(path, get_array_module())
+        provenance, origin = metadata.get("provenance", {}), metadata.get("refined_from")
+        return cls(network, provenance, path.name, path, origin=origin, half=metadata["half"])
+
+    @classmethod
+    def open(cls: type[Field], field: Any) -> Field:
+        """Return a field of this class, loaded if ``field`` is a file. Raises `NergError` as `load`, and for a field
+        of another kind."""
+        if isinstance(field, cls):
+            return field
+        if isinstance(field, TrainedField):
+            raise NergError(f"a {cls.kind} field is needed, and {field!r} is none")
+        return cls.load(field)
+
+    @staticmethod
+    def _read(path: Path, ns: ModuleType) -> tuple[Any, dict[str, Any]]:
+        """Read the networks and the metadata of a checkpoint."""
+        raise NotImplementedError
+
+    def _write(self, path: Path, half: bool) -> None:
+        """Write a checkpoint."""
+        raise NotImplementedError
 
     @property
-    def kind(self) -> str:
-        """``radiance`` or ``gaze``."""
-        return "radiance" if isinstance(self.network, RadianceField) else "gaze"
+    def held_out(self) -> str | None:
+        """The score on data that was not trained on, in words; None if the provenance has none."""
+        raise NotImplementedError
+
+    @property
+    def members(self) -> int:
+        """Number of fields in an ensemble; 1 without one."""
+        return 1
+
+    @property
+    def label(self) -> str:
+        """What messages call the field: its file in quotes, or "the gaze field in memory"."""
+        return f"the {self.kind} field in memory" if self.path is None else f'"{self.path}"'
 
     @property
     def bounds(self) -> NDArray[np.float64]:
@@ -95,23 +131,21 @@ class TrainedField(Generic[Network]):
         path, half = Path(path), self.half if half is None else half
         if path.suffix.lower() != ".safetensors":
             raise NergError(f'fields are saved as .safetensors; change the file name extension of "{path}"')
-        if isinstance(self.network, RadianceField):
-            save_radiance(self.network, path, dict(self.provenance), half, self.origin)
-        else:
-            save_gaze(self.network, path, dict(self.provenance), half)
+        self._write(path, half)
         return path
 
     def __repr__(self) -> str:
         lower, upper = (", ".join(f"{x:.3g}" for x in corner) for corner in self.bounds)
-        members = 1 if isinstance(self.network, RadianceField) else len(self.network.members)
-        what = f"{self.kind} field" if members == 1 else f"ensemble of {members} gaze fields"
+        what = f"{self.kind} field" if self.members == 1 else f"ensemble of {self.members} {self.kind} fields"
         name = f"{self.name}{tracking_suffix(self.provenance)}"
-        return f"<{what} {name}: {self.num_weights:,} weights, box ({lower}) to ({upper})>"
+        score = f", {self.held_out}" if self.held_out else ""
+        return f"<{what} {name}: {self.num_weights:,} weights, box ({lower}) to ({upper}){score}>"
 
     def _repr_html_(self) -> str:
         lower, upper = (", ".join(f"{x:.3g}" for x in corner) for corner in self.bounds)
         rows = [(f"{self.kind} field", self.name), ("weights", f"{self.num_weights:,}")]
         rows.append(("box", f"({lower}) to ({upper})"))
+        rows += [("held-out score", self.held_out)] if self.held_out else []
         facts = dict(self.provenance)
         if self.provenance.get("rays"):
             facts["tracking"] = read_tracking(self.provenance)
@@ -126,46 +160,3 @@ class TrainedField(Generic[Network]):
 
 def _format(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
-def load_field(path: FilePath) -> TrainedField[RadianceField]:
-    """Load a radiance field: density and colour of an environment.
-
-    Parameters
-    ----------
-    path : path
-        A checkpoint written by ``nerg train radiance``, `train_radiance` or ``nerg import``.
-
-    Returns
-    -------
-    TrainedField
-        The field, for `make_scene`.
-
-    Raises
-    ------
-    NergError
-        The file does not exist, is damaged, or contains something else.
-
-    Examples
-    --------
-    >>> import nerg_mi as nerg
-    >>> from importlib.resources import files
-    >>> store = files("nerg_mi.scenes.store")
-    >>> field = nerg.load_field(store / "store.safetensors")
-    >>> field.bounds.tolist()
-    [[-0.1, -0.1, -0.1], [8.1, 6.1, 3.1]]
-    """
-    network, metadata = load_radiance(to_path(path), get_array_module())
-    origin = metadata.get("refined_from")
-    return TrainedField(
-        network, metadata.get("provenance", {}), Path(path).name, Path(path), origin=origin, half=metadata["half"]
-    )
-
-
-def open_field(field: TrainedField[RadianceField] | FilePath) -> TrainedField[RadianceField]:
-    """Return ``field``, loaded if it is a file."""
-    if not isinstance(field, TrainedField):
-        return load_field(field)
-    if field.kind != "radiance":
-        raise NergError(f"a radiance field is needed, and {field!r} is none")
-    return field

@@ -11,10 +11,10 @@ import numpy as np
 from nerg_mi.fields.kde import Backend, SphericalKde
 from nerg_mi.maths.sphere import aim
 from nerg_mi.maths.vmf import log_normaliser
-from nerg_mi.probes.probes import compute_participant_weights
-from nerg_mi.rays.folds import iter_folds, sample_participants_equally
-from nerg_mi.rays.rays import Rays
-from nerg_mi.train.gaze_data import select_prior_kappa
+from nerg_mi.tracking.folds import iter_folds, sample_participants_equally
+from nerg_mi.tracking.probes import compute_participant_weights
+from nerg_mi.tracking.rays import Rays
+from nerg_mi.train.prior import select_prior_kappa
 
 # Each baseline is a function ``(positions (P, 3), directions) -> (P, D)`` that returns densities in 1/sr, which
 # integrate to one; ``directions`` is (D, 3) for all positions or (P, D, 3).
@@ -22,7 +22,7 @@ from nerg_mi.train.gaze_data import select_prior_kappa
 # A comparison is only fair if a baseline is tuned as carefully as the field. Number of neighbours, kernels and the
 # weight of the position-independent prior are therefore those with the highest log density of held-out rays, over folds
 # of the training rays that hold out what the test holds out: participants, positions, or both. The prior is that of a
-# gaze field (`train.gaze_data.select_prior_kappa`).
+# gaze field (`train.prior.select_prior_kappa`).
 
 Baseline = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Densities (P, D), 1/sr, of positions (P, 3) in directions (D, 3) or (P, D, 3)."""
@@ -107,7 +107,7 @@ def make_prior_baseline(
     return evaluate
 
 
-class Neighbours:
+class NearestRays:
     """The training rays nearest to a position, as seen from it.
 
     Parameters
@@ -143,7 +143,7 @@ class NeighbourDensity:
 
     Parameters
     ----------
-    neighbours : Neighbours
+    neighbours : NearestRays
         Training rays.
     prior : Baseline
         Position-independent prior.
@@ -161,7 +161,7 @@ class NeighbourDensity:
 
     def __init__(
         self,
-        neighbours: Neighbours,
+        neighbours: NearestRays,
         prior: Baseline,
         *,
         count: int,
@@ -268,7 +268,7 @@ def make_tuned_baselines(
         best = DEFAULT_SETTINGS[name]
         if folds:
             best = settings[name][int(np.concatenate(scores[name], axis=1).mean(axis=1).argmax())]
-        neighbours = Neighbours(rays, rays.hit if is_aimed else None)
+        neighbours = NearestRays(rays, rays.hit if is_aimed else None)
         tuned[name] = TunedBaseline(_make_neighbour_density(neighbours, prior, best), best, folds)
     return tuned
 
@@ -287,7 +287,9 @@ def format_settings(baselines: Mapping[str, TunedBaseline]) -> str:
     return f"Settings of the baselines, {source}: {'; '.join(parts)}."
 
 
-def _make_neighbour_density(neighbours: Neighbours, prior: Baseline, settings: Mapping[str, float]) -> NeighbourDensity:
+def _make_neighbour_density(
+    neighbours: NearestRays, prior: Baseline, settings: Mapping[str, float]
+) -> NeighbourDensity:
     return NeighbourDensity(
         neighbours,
         prior,
@@ -300,7 +302,7 @@ def _make_neighbour_density(neighbours: Neighbours, prior: Baseline, settings: M
 
 def _score_neighbours(train: Rays, test: Rays, prior: np.ndarray, is_conditional: bool, is_aimed: bool) -> _Candidates:
     """Score the densities of the neighbours of ``train`` at the n rays ``test``; ``prior`` (n,) are the prior's."""
-    neighbours = Neighbours(train, train.hit if is_aimed else None)
+    neighbours = NearestRays(train, train.hit if is_aimed else None)
     counts = COUNTS[-1:] if is_conditional else COUNTS
     keys = [
         {"rays": float(counts[-1]), "bandwidth": h} if is_conditional else {"rays": float(k)}
@@ -327,7 +329,7 @@ def _score_neighbours(train: Rays, test: Rays, prior: np.ndarray, is_conditional
     return _Candidates(settings, np.array(log_density))
 
 
-def _iter_cosines(neighbours: Neighbours, test: Rays, count: int) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
+def _iter_cosines(neighbours: NearestRays, test: Rays, count: int) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
     """Yield, for blocks of the rays ``test``, the distances (b, k) of their neighbours and the cosines (b, k) of the
     angles to them."""
     for start in range(0, len(test), _BLOCK):

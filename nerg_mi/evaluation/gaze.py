@@ -11,18 +11,17 @@ from typing import NamedTuple
 import numpy as np
 
 from nerg_mi.errors import NergError, parameter
-from nerg_mi.fields.gaze_base import AnyGazeField
+from nerg_mi.fields.gaze_base import GazeNetwork
 from nerg_mi.fields.kde import SphericalKde
 from nerg_mi.maths.arrays import to_vector
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.maths.types import variant_types
-from nerg_mi.probes.probes import place_probes
-from nerg_mi.rays.filters import purge, split_by_person
-from nerg_mi.rays.folds import sample_participants_equally
-from nerg_mi.rays.rays import Rays
-from nerg_mi.train.gaze_data import SURFACE_OPACITY
-from nerg_mi.transport.geometry import SceneGeometry, default_march_settings
+from nerg_mi.tracking.filters import purge, split_by_person
+from nerg_mi.tracking.folds import sample_participants_equally
+from nerg_mi.tracking.probes import place_probes
+from nerg_mi.tracking.rays import Rays
+from nerg_mi.transport.geometry import SURFACE_OPACITY, SceneGeometry, default_march_settings
 from nerg_mi.transport.observer import ObserverSettings
 from nerg_mi.transport.observer_batch import evaluate_densities
 from nerg_mi.transport.observer_gaze import GazeFieldInstance, ObservedGaze
@@ -67,7 +66,7 @@ class FieldDensity:
 
     Parameters
     ----------
-    field : AnyGazeField
+    field : GazeNetwork
         Gaze field.
     medium : medium, SceneGeometry or None
         Medium or scene in which observer depths are traced, in the frame of the field; None for a field without
@@ -91,7 +90,7 @@ class FieldDensity:
 
     def __init__(
         self,
-        field: AnyGazeField,
+        field: GazeNetwork,
         medium,
         align: Similarity | None = None,
         depth_kind: str = "median",
@@ -236,7 +235,7 @@ def select_held_out_rays(
     rays: Rays, holdout: dict, split: str = "both", seed: int = 0
 ) -> tuple[Rays, Rays, np.ndarray]:
     """Select training and test rays according to the ``holdout`` description of a checkpoint
-    (``train.gaze_data.hold_out``).
+    (``train.gaze_folds.hold_out``).
 
     Parameters
     ----------
@@ -399,7 +398,7 @@ def _has_enough_rays(rays: Rays, centres: np.ndarray, radius: float, min_rays: i
     return KDTree(rays.origin).query_ball_point(centres, radius, return_length=True) >= min_rays
 
 
-def evaluate_gaze(
+def score_methods(
     test: GazeTest,
     methods: dict[str, Baseline],
     prior: Baseline,
@@ -572,7 +571,8 @@ def score_split_half(
     """Score one half of the participants as predicted by the other half, at positions where both have ``min_rays``
     rays.
 
-    This is a reference, not an upper bound.
+    This is a reference, not an upper bound. It is left out if its own score is not above that of the prior, so that the
+    references that are shown are a little too good.
 
     Returns
     -------
@@ -598,7 +598,7 @@ def score_split_half(
     )
     participants = min(len(first.participants), len(np.unique(halves[1].person[probes.indices])))
     predicted = lambda positions, directions: probes.density(directions)
-    row = evaluate_gaze(first, {SPLIT_HALF: predicted}, prior, resamples, seed)[0]
+    row = score_methods(first, {SPLIT_HALF: predicted}, prior, resamples, seed)[0]
     note = find_split_half_fault(participants, row[HEADLINE], row.get(f"{HEADLINE}.low", math.nan))
     return (None if note else {k: v for k, v in row.items() if "." not in k}), note
 

@@ -16,7 +16,7 @@ from nerg_mi.files.atomic import write_text
 from nerg_mi.files.safe_read import is_count, read_json
 from nerg_mi.files.tables import format_markdown_table, write_csv, write_json
 from nerg_mi.maths.sphere import Z_UP, latlong_grid
-from nerg_mi.probes.probes import REGION_LEVELS, format_level
+from nerg_mi.tracking.probes import REGION_LEVELS, format_level
 
 from .baselines import CONDITIONAL_KDE, NEAREST_RAYS, PRIOR, REAIMED_HITS, UNIFORM, Baseline
 from .gaze import MAP_SCORES, SCORES, SPLIT_HALF, GazeTest, find_split_half_fault
@@ -309,7 +309,7 @@ def _make_error(path: str | Path, why: str) -> NergError:
 #   than the prior: useful, and the comparison with the nearest rays and any stronger baseline decides whether it
 #   is worth a field. The sentence names the strongest baseline, the one with the highest log score.
 #
-# The intervals are those of the bootstrap over participants (`workflows.evaluate_gaze`), widened for small samples: by
+# The intervals are those of the bootstrap over participants (`held_out.evaluate_gaze`), widened for small samples: by
 # sqrt(n / (n - 1)), because a bootstrap of n participants is too narrow by this factor, and by Student's quantile with
 # n - 1 degrees of freedom in place of 1.96 (Hesterberg, What Teachers Should Know About the Bootstrap, 2015). If only
 # the intervals of both methods are known, the half-width of the difference is the sum of theirs, which is never too
@@ -515,7 +515,8 @@ def _write_verdict(
 def _find_strongest(rows: Sequence[Mapping[str, Any]]) -> str:
     """Return the name of the baseline with the highest log score; "" if none has one.
 
-    The split half is not a baseline, and all kernels of the prior share one name.
+    The samples that score choose it, which favours the baselines and never the field. The split half is not a baseline,
+    and all kernels of the prior share one name.
     """
     scored = [r for r in rows[1:] if r.get("method") != SPLIT_HALF and not math.isnan(_read_number(r, "bits"))]
     best = max(scored, key=lambda r: _read_number(r, "bits"), default={})

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Callable, Collection
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from nerg_mi.environment.contents import FieldVolume
+from nerg_mi.environment.radiance import RadianceField
 from nerg_mi.errors import NergError, parameter, translate_mitsuba_errors
 from nerg_mi.figures.overlay import srgb, write_png
-from nerg_mi.figures.style import make_provenance
+from nerg_mi.figures.style import existing_files, make_provenance
 from nerg_mi.files.atomic import make_folder
 from nerg_mi.files.dataframes import ResultTables
 from nerg_mi.files.names import make_portable_names
 from nerg_mi.files.tables import add_notes
+from nerg_mi.files.values import FilePath
 from nerg_mi.maths.arrays import check_weights
 from nerg_mi.maths.color import color_corrected_psnr, mean_ignoring_nan, psnr
 from nerg_mi.photos.cameras import PosedCamera, make_sensor_dict, pixel_directions
@@ -111,14 +114,14 @@ _MAX_LAUNCH = 1 << 23  # Maximum samples per launch, to limit memory
 
 
 class FieldRenderer:
-    """Renders the field of a checkpoint with the cameras of a data set. Needs a Mitsuba variant."""
+    """Renders a radiance field, or its file, with the cameras of a data set. Needs a Mitsuba variant."""
 
-    def __init__(self, field: str | Path, spp: int = 16):
+    def __init__(self, field: RadianceField | FilePath, spp: int = 16):
         import mitsuba as mi
 
         self.spp = spp
-        integrator = {"type": "nerg", "field": {"type": "nerf", "filename": str(field)}, "aovs": "depth,opacity"}
-        with translate_mitsuba_errors(field):
+        with translate_mitsuba_errors(None if isinstance(field, RadianceField) else field):
+            integrator = {"type": "nerg", "field": FieldVolume(field, "field").load(), "aovs": "depth,opacity"}
             self.scene = mi.load_dict({"type": "scene", "integrator": integrator})
 
     def __call__(self, camera: PosedCamera, seed: int = 0) -> RenderedView:
@@ -183,52 +186,65 @@ class ViewScores(ResultTables):
     ssim: list[float]  # SSIM of each view; NaN if it has no window of 11 x 11 pixels
     # PSNR of the right half of each view in dB after fitting its colours on the left half; NaN without pixels.
     psnr_fitted: list[float]
-    depth: DepthScore | None  # Means over the views with true depth; None if there are none
+    # Means over the views with true depth that did not choose the state; None if there are none.
+    depth: DepthScore | None
+    # Names of those ``views`` that chose the state of the field; they have means of their own.
+    validation: list[str] = field(default_factory=list)
 
     @property
     def rows(self) -> list[dict]:
-        """One row per view; the ``note`` says why scores are missing."""
-        columns = self.views, self.psnr, self.ssim, self.psnr_fitted
-        rows: list[dict[str, Any]] = [dict(zip(("view", "psnr", "ssim", "psnr_fitted"), row)) for row in zip(*columns)]
+        """One row per view, with whether it chose the state; the ``note`` says why scores are missing."""
+        columns = self.views, self.psnr, self.ssim, self.psnr_fitted, [v in self.validation for v in self.views]
+        names = "view", "psnr", "ssim", "psnr_fitted", "chose_state"
+        rows: list[dict[str, Any]] = [dict(zip(names, row)) for row in zip(*columns)]
         add_notes(rows, lambda row, column: (column, _NO_SCORE.get(column, "")))
         return rows
 
     @property
     def psnr_mean(self) -> float:
-        """Mean over the views in dB."""
-        return mean_ignoring_nan(self.psnr)
+        """Mean over the views in dB, except those that chose the state."""
+        return self._compute_mean(self.psnr)
 
     @property
     def psnr_fitted_mean(self) -> float:
-        """Mean over the views with fitted colours in dB."""
-        return mean_ignoring_nan(self.psnr_fitted)
+        """Mean with fitted colours in dB, over the same views."""
+        return self._compute_mean(self.psnr_fitted)
 
     @property
     def ssim_mean(self) -> float:
-        """Mean over the views with windows."""
-        return mean_ignoring_nan(self.ssim)
+        """Mean over those of the same views that have windows."""
+        return self._compute_mean(self.ssim)
+
+    @property
+    def validation_means(self) -> dict[str, float]:
+        """Means of ``psnr``, ``ssim`` and ``psnr_fitted`` over the views that chose the state."""
+        return {name: self._compute_mean(getattr(self, name), True) for name in ("psnr", "ssim", "psnr_fitted")}
+
+    def _compute_mean(self, scores: list[float], is_validation: bool = False) -> float:
+        return mean_ignoring_nan([s for v, s in zip(self.views, scores) if (v in self.validation) == is_validation])
 
     def to_dict(self) -> dict:
         """Return the fields, means and notes on missing scores for JSON, without ``depth`` if it is None."""
         names = ["views", "width", "height", "spp", "psnr", "psnr_mean", "ssim", "ssim_mean"]
-        names += ["psnr_fitted", "psnr_fitted_mean"]
+        names += ["psnr_fitted", "psnr_fitted_mean", "validation", "validation_means"]
         out = {name: getattr(self, name) for name in names} | {"notes": [row["note"] for row in self.rows]}
         return out if self.depth is None else out | {"depth": asdict(self.depth)}
 
 
 def score_views(
-    field: str | Path,
+    field: RadianceField | FilePath,
     views: list[PhotoView],
     spp: int = 16,
     picture_folder: Path | None = None,
     on_view: Callable[[str, float, float], None] = lambda name, psnr, ssim: None,
+    validation: Collection[str] = (),
 ) -> ViewScores:
-    """Score the field of a checkpoint on ``views``.
+    """Score a radiance field on ``views``.
 
     Parameters
     ----------
-    field : str or Path
-        Checkpoint of a radiance field.
+    field : RadianceField or path
+        The radiance field.
     views : list of PhotoView
         Posed photos.
     spp : int
@@ -237,6 +253,8 @@ def score_views(
         Folder for pictures of each rendering, with the photo to its right.
     on_view : callable
         Called with the name, PSNR in dB and SSIM of each view.
+    validation : collection of str
+        Names of views that chose the state of the field, which may include others than ``views``.
 
     Raises
     ------
@@ -252,7 +270,9 @@ def score_views(
     text: dict[str, str] = {}
     if picture_folder is not None:
         make_folder(picture_folder)
-        text = make_provenance("nerg eval radiance", [field], None, {"spp": spp}).text()
+        text = make_provenance(
+            "nerg eval radiance", existing_files(getattr(field, "path", field)), None, {"spp": spp}
+        ).text()
     names = make_portable_names(Path(view.name).stem for view in views)
     for k, view in enumerate(views):
         rendered, truth = render(view.camera, k), view.composite_over(0)
@@ -260,7 +280,7 @@ def score_views(
         alpha = view.color[..., 3] if view.has_alpha else None
         fitted = color_corrected_psnr(rendered.color, truth, alpha, mask)
         rows.append((psnr(rendered.color, truth, mask), ssim(rendered.color, truth, mask), fitted))
-        if view.depth is not None:
+        if view.depth is not None and view.name not in validation:
             depths.append(compute_depth_score(rendered.depth, rendered.opacity, np.where(mask, view.depth, 0)))
         if picture_folder is not None:
             both = np.concatenate([rendered.color, truth], axis=1)
@@ -276,6 +296,7 @@ def score_views(
         ssim=[r[1] for r in rows],
         psnr_fitted=[r[2] for r in rows],
         depth=_mean_depth_score(depth_scores) if depth_scores else None,
+        validation=[v.name for v in views if v.name in validation],
     )
 
 

@@ -31,10 +31,10 @@ import numpy as np
 from nerg_mi.errors import NergError, parameter
 from nerg_mi.maths import vmf
 from nerg_mi.maths.sphere import aim, fibonacci_directions, sample_uniform_directions
-from nerg_mi.probes.probes import compute_participant_weights
-from nerg_mi.rays.direction_checks import compute_head_frames
-from nerg_mi.rays.filters import find_sessions
-from nerg_mi.rays.rays import Rays
+from nerg_mi.tracking.direction_checks import compute_head_frames
+from nerg_mi.tracking.filters import find_sessions
+from nerg_mi.tracking.probes import compute_participant_weights
+from nerg_mi.tracking.rays import Rays
 
 from .baselines import MIN_AIM_DISTANCE, UNIFORM_DENSITY
 from .gaze import EPS

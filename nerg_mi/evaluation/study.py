@@ -8,7 +8,7 @@ import statistics
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import drjit as dr
 import numpy as np
@@ -19,7 +19,7 @@ from nerg_mi.transport.depth import DEPTHS
 from nerg_mi.transport.field_medium import make_color_shader
 from nerg_mi.transport.geometry import SceneGeometry
 from nerg_mi.transport.march_primal import SEPARATE_COLOR_CUTOFF
-from nerg_mi.transport.observer import visibility
+from nerg_mi.transport.occlusion import visibility
 from nerg_mi.transport.quadrature import RULES
 
 from . import study_truth
@@ -61,7 +61,16 @@ PAPER_DT_GAMMA = 1 / 128  # Default step growth of the paper's code for scenes l
 PAPER_STOP = 1e-4
 
 
-def make_paper_integrator(integrator, sensor, tolerance: float, steps: int = PAPER_STEPS, dt_gamma: float = 0.0):
+class PaperMarch(NamedTuple):
+    """Settings of the march of the paper, and two corrections of its depth, which its code does not have."""
+
+    steps: int = PAPER_STEPS  # Steps along the diagonal of the medium, and maximum number of samples per ray
+    dt_gamma: float = 0.0  # Growth γ of steps with distance
+    depth_at: float = 1.0  # Where in a step its depth is taken: 1 at the end, as in the paper, 0.5 in the middle
+    divides_by_opacity: bool = False
+
+
+def make_paper_integrator(integrator, sensor, tolerance: float, march: PaperMarch):
     """Make an integrator that marches as in the paper, with the field, gaze, observer and AOVs of ``integrator`` (a
     ``nerg``).
 
@@ -73,10 +82,8 @@ def make_paper_integrator(integrator, sensor, tolerance: float, steps: int = PAP
         Camera, which is the observer if there is no other.
     tolerance : float
         Tolerance of the visibility in scene units.
-    steps : int
-        Steps along the diagonal of the medium, and maximum number of samples per ray.
-    dt_gamma : float
-        Growth γ of steps with distance.
+    march : PaperMarch
+        Steps, and corrections of the depth.
 
     Notes
     -----
@@ -84,7 +91,7 @@ def make_paper_integrator(integrator, sensor, tolerance: float, steps: int = PAP
     """
     import mitsuba as mi
 
-    return _integrator_class(mi.variant())(integrator, sensor, tolerance, steps, dt_gamma)
+    return _integrator_class(mi.variant())(integrator, sensor, tolerance, march)
 
 
 @functools.cache
@@ -93,18 +100,10 @@ def _integrator_class(variant: str):
     import mitsuba as mi
 
     class PaperIntegrator(mi.SamplingIntegrator):
-        def __init__(self, like, sensor, tolerance, steps, dt_gamma):
+        def __init__(self, like, sensor, tolerance, settings):
             super().__init__(mi.Properties())
             self._like, self._sensor, self._tolerance = like, sensor, tolerance
-            extent = like.medium.length_scale
-            self._march = functools.partial(
-                march_as_in_paper,
-                like.medium,
-                steps=steps,
-                min_step=extent / steps,
-                max_step=max(extent / 128, extent / steps),
-                dt_gamma=dt_gamma,
-            )
+            self._march = functools.partial(march_as_in_paper, like.medium, settings=settings)
 
         def aov_names(self):
             return self._like.aov_names()
@@ -159,7 +158,7 @@ def _integrator_class(variant: str):
     return PaperIntegrator
 
 
-def march_as_in_paper(medium, ray, t0, t1, active, shader, *, steps, min_step, max_step, dt_gamma):
+def march_as_in_paper(medium, ray, t0, t1, active, shader, settings: PaperMarch):
     """March ``ray`` (`LocalRay`) between ``t0`` and ``t1``.
 
     Returns ``(opacity, depth, sum of the sample contributions, number of samples)``. ``shader`` computes the
@@ -168,9 +167,10 @@ def march_as_in_paper(medium, ray, t0, t1, active, shader, *, steps, min_step, m
     Float = type(ray.t_near)
     # The grid of the paper has no refined cells.
     grid: Any = None if medium.occupancy is None else medium.occupancy.coarse
+    extent, steps = medium.length_scale, settings.steps
 
     def length(t):
-        return dr.clip(t * dt_gamma, min_step, max_step)
+        return dr.clip(t * settings.dt_gamma, extent / steps, max(extent / 128, extent / steps))
 
     def leave(seeking, t):
         """Out of an empty cell in whole steps, at least one."""
@@ -195,7 +195,7 @@ def march_as_in_paper(medium, ray, t0, t1, active, shader, *, steps, min_step, m
         else:
             sigma, features = medium.density_features(p, is_active)
         weight = dr.select(is_active, (1 - dr.exp(-sigma * dt)) * transmittance, 0)
-        moment = moment + weight * (t + dt)
+        moment = moment + weight * (t + settings.depth_at * dt)
         if shader is not None:
             total = total + weight * shader.shade(medium, features, p, ray.w, is_active)
         # The kernels test the transmittance in front of the sample, so one more sample is taken.
@@ -213,7 +213,10 @@ def march_as_in_paper(medium, ray, t0, t1, active, shader, *, steps, min_step, m
         Float(0),
     )
     _, _, transmittance, moment, total, n = dr.while_loop(start, lambda active, *_: active, body, label="paper march")
-    return 1 - transmittance, moment, total, n
+    alpha = 1 - transmittance
+    if settings.divides_by_opacity:
+        moment = moment / dr.select(alpha > 0, alpha, 1)
+    return alpha, moment, total, n
 
 
 # ---- Settings ----
@@ -235,7 +238,7 @@ class StudyRow:
     spp: int = 1  # Samples per pixel
     resolution: int = 0  # Resolution of the density as a grid; 0: the density of the scene
     voxels: int = 0  # Resolution of the voxels to which the field is compiled; 0: the field itself
-    paper: tuple[int, float] | None = None  # (steps, γ) of the march of the paper; None: the march of this package
+    paper: PaperMarch | None = None  # The march of the paper; None: that of this package
     is_first_frame: bool = False  # Whether caches are cleared before each frame
 
     def make_integrator(self, subject, **extra_params):
@@ -244,7 +247,7 @@ class StudyRow:
         return (
             integrator
             if self.paper is None
-            else make_paper_integrator(integrator, subject.sensor, subject.tolerance, *self.paper)
+            else make_paper_integrator(integrator, subject.sensor, subject.tolerance, self.paper)
         )
 
 
@@ -380,9 +383,11 @@ def _paper_rows(quick: bool) -> list[StudyRow]:
     counts = (64, PAPER_STEPS) if quick else (128, 256, 512, PAPER_STEPS, 2048, 4096)
     # The march of the paper compares expected depths, whatever the scene uses.
     params = {"depth": "expected", "visibility": "depth"}
-    rows = [StudyRow(f"paper, {n} steps", PAPER, params, paper=(n, 0.0)) for n in counts]
+    rows = [StudyRow(f"paper, {n} steps", PAPER, params, paper=PaperMarch(n)) for n in counts]
     return rows + [
-        StudyRow(f"paper, {PAPER_STEPS} steps, dt_gamma 1/128", PAPER, params, paper=(PAPER_STEPS, PAPER_DT_GAMMA))
+        StudyRow(
+            f"paper, {PAPER_STEPS} steps, dt_gamma 1/128", PAPER, params, paper=PaperMarch(dt_gamma=PAPER_DT_GAMMA)
+        )
     ]
 
 
@@ -444,9 +449,9 @@ def measure_rows(
 def _collect_parameters(subject, row: StudyRow, integrator) -> dict:
     values = read_parameters(integrator)
     if row.paper is not None:
-        steps, dt_gamma = row.paper
-        values |= {"quadrature": "paper", "step": subject.extent / steps, "dt_gamma": dt_gamma, "stop": PAPER_STOP}
-        values |= {"color_cutoff": 0.0, "coarse": 1.0, "jitter": False, "depth": "unnormalised", "refined": False}
+        step, depth = subject.extent / row.paper.steps, "expected" if row.paper.divides_by_opacity else "unnormalised"
+        values |= {"quadrature": "paper", "step": step, "dt_gamma": row.paper.dt_gamma, "stop": PAPER_STOP}
+        values |= {"color_cutoff": 0.0, "coarse": 1.0, "jitter": False, "depth": depth, "refined": False}
     if values["visibility"] != "map":
         values["map_height"] = ""
     if not subject.is_marched:

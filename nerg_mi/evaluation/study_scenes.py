@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from nerg_mi.fields.encoding import HashGridConfig
-from nerg_mi.fields.gaze_product import GazeConfig, GazeField
+from nerg_mi.fields.gaze_product import GazeConfig, ProductHead
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.maths.geometry import Box
 from nerg_mi.transport.observer_gaze import GazeFieldInstance
@@ -191,7 +191,7 @@ def _make_volume_classes(variant: str):
             config = GazeConfig(
                 HashGridConfig(levels=2, log2_rows=10, base=3, finest=6), width=16, geometry=7, sh_degree=2
             )
-            field = GazeField.random(config, Box((0, 0, 0), (1, 1, 1)), ns, seed=1)
+            field = ProductHead.random(config, Box((0, 0, 0), (1, 1, 1)), ns, seed=1)
             rows = dr.width(field.parameters()["grid.table"])
             table = 2 * np.random.default_rng(1).normal(size=rows).astype(np.float32)
             field.set_parameters({"grid.table": ns.Float(table)})

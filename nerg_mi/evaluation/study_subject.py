@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError
+from nerg_mi.environment.bands import is_nerg
+from nerg_mi.environment.scene_loading import load_scene
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.fields.compilation import attach_voxels, bound_voxel_bytes, compile_density
 from nerg_mi.files.safe_read import resolve_path
-from nerg_mi.rendering.bands import is_nerg
-from nerg_mi.rendering.scene import load_scene
 from nerg_mi.transport.depth import DEPTHS
 from nerg_mi.transport.field_medium import FieldMedium
 from nerg_mi.transport.geometry import SceneGeometry
@@ -107,19 +107,19 @@ def no_exact_surfaces(scene: Path) -> ExactSurfaces | None:
 
 
 def open_subject(
-    scene: str,
+    scene: Any,
     kind: str,
     width: int,
     height: int,
     defaults: Mapping[str, str] | None = None,
     surfaces: Callable[[Path], ExactSurfaces | None] = no_exact_surfaces,
 ) -> StudySubject:
-    """Open an analytic scene by name, or a scene file.
+    """Open an analytic scene by name, a scene file, or a Mitsuba scene.
 
     Parameters
     ----------
-    scene : str
-        Name of an analytic scene, or path of a scene file.
+    scene : str, path or mi.Scene
+        Name of an analytic scene, path of a scene file, or a scene.
     kind : str
         One of `KINDS`.
     width, height : int
@@ -136,14 +136,20 @@ def open_subject(
     """
     if kind not in KINDS:
         raise NergError(f'the kind of scene must be one of {", ".join(KINDS)}, got "{kind}"')
-    if kind == "analytic" or (kind == "auto" and scene in SCENES):
-        if scene not in SCENES:
+    name = str(scene)
+    is_analytic = kind == "analytic" or (kind == "auto" and name in SCENES)
+    if defaults and (is_analytic or not isinstance(scene, (str, Path))):
+        raise NergError(f"{parameter('defaults')} are those of a scene file; pass one, or leave them out")
+    if not isinstance(scene, (str, Path)):
+        return load_subject(scene, width, height)
+    if is_analytic:
+        if name not in SCENES:
             raise NergError(f'there is no analytic scene "{scene}": choose one of {", ".join(SCENES)}')
-        return AnalyticSubject(SCENES[scene], width, height)
+        return AnalyticSubject(SCENES[name], width, height)
     if not Path(scene).exists():
         names = ", ".join(SCENES)
         raise NergError(f'"{scene}" is neither a scene file nor one of the analytic scenes {names}')
-    return load_subject(Path(scene), width, height, defaults or {}, surfaces)
+    return load_subject(Path(scene), width, height, defaults, surfaces)
 
 
 class StudySubject:
@@ -436,14 +442,17 @@ class ShapesSubject(FileSubject):
 
 
 def load_subject(
-    path: Path,
+    source: Any,
     width: int,
     height: int,
-    defaults: Mapping[str, str],
+    defaults: Mapping[str, str] | None = None,
     surfaces: Callable[[Path], ExactSurfaces | None] = no_exact_surfaces,
 ) -> FileSubject:
-    """Load the scene in the file ``path``, of a field or of shapes; see `open_subject`."""
-    scene = load_scene(path, defaults)
+    """Load a scene of a field or of shapes from a file, or use a Mitsuba scene; see `open_subject`."""
+    path = source if isinstance(source, Path) else Path("scene in memory")
+    scene = load_scene(path, defaults) if isinstance(source, Path) else source
+    if type(scene).__name__ != "Scene":
+        raise NergError(f"a scene must be a file or a Mitsuba scene, got {type(scene).__name__}")
     if not is_nerg(scene.integrator()):
         raise NergError(f'the integrator of "{path}" is not "nerg"; use a scene with this integrator')
     if not scene.sensors():
@@ -459,4 +468,5 @@ def load_subject(
 
     if scene.integrator().medium is None:
         return ShapesSubject(path, scene, width, height)
-    return FileSubject(path, scene, width, height, surfaces(path))
+    exact = surfaces(path) if isinstance(source, Path) else None
+    return FileSubject(path, scene, width, height, exact)

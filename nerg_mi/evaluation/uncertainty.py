@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.probes.probes import REGION_LEVELS, compute_region_levels, format_level, get_calibrated_level
+from nerg_mi.tracking.probes import REGION_LEVELS, compute_region_levels, format_level, get_calibrated_level
 
 from . import metrics
 from .gaze import EPS, SCORES, SPLIT_HALF, GazeTest
@@ -142,7 +142,7 @@ def measure_calibration(
     resamples, seed : int
         Bootstrap of the participants.
     calibrated : mapping, optional
-        Calibrated levels of methods (`probes.probes.calibrate_levels`). Each adds a row "METHOD, calibrated".
+        Calibrated levels of methods (`tracking.probes.calibrate_levels`). Each adds a row "METHOD, calibrated".
 
     Returns
     -------
@@ -221,7 +221,7 @@ _SCORES = (*SCORES, "integral")
 
 
 def summarise_folds(folds: Sequence[Sequence[Mapping[str, Any]]], confidence: float = 0.95) -> list[dict[str, Any]]:
-    """Average the scores and the integral of ``folds``, the rows of `workflows.evaluate_gaze` with the field's first.
+    """Average the scores and the integral of ``folds``, the rows of `held_out.evaluate_gaze` with the field's first.
 
     The last row is the difference of the field to the last method, fold by fold.
     """

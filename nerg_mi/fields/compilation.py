@@ -14,7 +14,7 @@ from nerg_mi.maths.arrays import copy_aligned
 from nerg_mi.maths.types import Array3f, UInt32
 
 from .occupancy import MIN_STEP_OPTICAL_DEPTH, CascadeGrid, cascades_from_contracted, dilate
-from .radiance import RadianceField
+from .radiance import RadianceNetwork
 from .voxels import BLOCK_EDGE, CELLS, VERTICES, VoxelArrays, VoxelGrid
 
 _BATCH = 1 << 12  # Blocks per launch
@@ -23,7 +23,7 @@ _BYTES_PER_BLOCK = 2 * VERTICES + CELLS // 8 + 4
 
 
 def compile_density(
-    field: RadianceField,
+    field: RadianceNetwork,
     resolution: int,
     start: VoxelGrid | None = None,
     max_bytes: float = math.inf,
@@ -36,7 +36,7 @@ def compile_density(
 
     Parameters
     ----------
-    field : RadianceField
+    field : RadianceNetwork
         A field that is not compiled.
     resolution : int
         Cells along an edge of the unit cube of its positions, a multiple of 8.
@@ -91,13 +91,13 @@ def _describe_excess(resolution: int, size: float, limit: float) -> str:
     )
 
 
-def bound_voxel_bytes(field: RadianceField, resolution: int) -> int:
+def bound_voxel_bytes(field: RadianceNetwork, resolution: int) -> int:
     """Upper bound of the size of `compile_density`'s result in bytes, from the field's occupancy alone."""
     with dr.suspend_grad():
         return _BYTES_PER_BLOCK * len(_candidate_blocks(field, resolution, None))
 
 
-def attach_voxels(field: RadianceField, voxels: VoxelGrid) -> RadianceField:
+def attach_voxels(field: RadianceNetwork, voxels: VoxelGrid) -> RadianceNetwork:
     """A compiled field with the networks of ``field``, and ``voxels``, which `compile_density` made of it."""
     compiled = copy.copy(field)
     compiled.occupancy = occupancy_of_voxels(field, voxels) or field.occupancy
@@ -105,7 +105,7 @@ def attach_voxels(field: RadianceField, voxels: VoxelGrid) -> RadianceField:
     return compiled
 
 
-def occupancy_of_voxels(field: RadianceField, voxels: VoxelGrid) -> CascadeGrid | None:
+def occupancy_of_voxels(field: RadianceNetwork, voxels: VoxelGrid) -> CascadeGrid | None:
     """Occupancy of a contracted ``field`` for its ``voxels``, whose own cells are not equal along rays; None for a box,
     in which the voxels are the occupancy."""
     if field.box.outer_scale is None or field.occupancy is None:
@@ -116,7 +116,7 @@ def occupancy_of_voxels(field: RadianceField, voxels: VoxelGrid) -> CascadeGrid 
     )
 
 
-def _candidate_blocks(field: RadianceField, resolution: int, start: VoxelGrid | None) -> np.ndarray:
+def _candidate_blocks(field: RadianceNetwork, resolution: int, start: VoxelGrid | None) -> np.ndarray:
     """Flat indices (uint32) of the blocks that may have matter."""
     n = resolution // BLOCK_EDGE
     if start is not None:
@@ -141,7 +141,7 @@ def _candidate_blocks(field: RadianceField, resolution: int, start: VoxelGrid | 
     return np.flatnonzero(blocks).astype(np.uint32)
 
 
-def _is_occupied(field: RadianceField, u: Array3f):
+def _is_occupied(field: RadianceNetwork, u: Array3f):
     """Whether the occupancy of ``field`` contains ``u`` (unit cube of encoded positions)."""
     p = field.box.from_unit(u)
     inside = field.box.contains(p)
@@ -156,7 +156,7 @@ def _corner(index: UInt32, n: int, ns) -> Array3f:
     return ns.Array3f(index % n, y, z)
 
 
-def _evaluate_blocks(field: RadianceField, blocks: np.ndarray, resolution: int) -> tuple[np.ndarray, np.ndarray]:
+def _evaluate_blocks(field: RadianceNetwork, blocks: np.ndarray, resolution: int) -> tuple[np.ndarray, np.ndarray]:
     """Log densities (float16, (N, 729)) and masks (uint32, (N, 16)) of the N ``blocks``."""
     ns, n, edge = field.ns, resolution // BLOCK_EDGE, BLOCK_EDGE + 1
     index = ns.UInt32(copy_aligned(blocks, np.uint32))

@@ -15,7 +15,7 @@ import numpy as np
 from nerg_mi.errors import NergError, parameter
 from nerg_mi.maths.arrays import to_vector
 
-from .radiance import RadianceField
+from .radiance import RadianceNetwork
 
 # Points per kernel launch: a few hundred megabytes of intermediate values.
 _BATCH = 1 << 21
@@ -34,7 +34,7 @@ class Lattice:
     shape: tuple[int, int, int]
 
     @staticmethod
-    def for_field(field: RadianceField, resolution: int) -> Lattice:
+    def for_field(field: RadianceNetwork, resolution: int) -> Lattice:
         """A lattice with ``resolution`` cells along the longest edge of the field's box, or of the core of a contracted
         box."""
         if resolution < 2:
@@ -60,7 +60,7 @@ class Lattice:
 class FieldSampler:
     """Evaluates a field at many points, in batches; densities are 0 in the empty cells of its occupancy grid."""
 
-    def __init__(self, field: RadianceField):
+    def __init__(self, field: RadianceNetwork):
         self.field, self.ns = field, field.ns
 
     def _density(self, p, masked: bool = True):
@@ -72,7 +72,7 @@ class FieldSampler:
     def density(self, p: np.ndarray, masked: bool = True) -> np.ndarray:
         """Density (1/unit) at points (N, 3); ``masked`` False: the output of the networks also in empty cells."""
         with dr.suspend_grad():
-            return _joined(lambda q: self._density(to_vector(self.ns.Array3f, q), masked).numpy(), p)
+            return _evaluate_in_batches(lambda q: self._density(to_vector(self.ns.Array3f, q), masked).numpy(), p)
 
     def density_on(self, lattice: Lattice) -> np.ndarray:
         """Density (z, y, x) at the lattice's points."""
@@ -109,7 +109,7 @@ class FieldSampler:
             return np.array(c).T if np.array(c).shape[0] == 3 else np.array(c)
 
         with dr.suspend_grad():
-            return _joined(ask, np.concatenate([p, directions], 1), 3)
+            return _evaluate_in_batches(ask, np.concatenate([p, directions], 1), 3)
 
     def diffuse_color(self, p: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """Colour (N, 3) of surface points, averaged over the normal and directions at 45 degrees, since a field's
@@ -125,7 +125,7 @@ class FieldSampler:
         return total / (1 + _TILTED)
 
 
-def _joined(ask, rows: np.ndarray, columns: int = 0) -> np.ndarray:
+def _evaluate_in_batches(ask, rows: np.ndarray, columns: int = 0) -> np.ndarray:
     shape = (len(rows), columns) if columns else (len(rows),)
     out = np.zeros(shape, np.float32)
     for start in range(0, len(rows), _BATCH):

@@ -185,7 +185,7 @@ class Arrays(Protocol):
         ...
 
 
-class AnyGazeField:
+class GazeNetwork:
     """Base of gaze fields on one backend: a single density (`GazeHead`), or the mean of several (`GazeEnsemble`).
 
     Attributes
@@ -236,7 +236,7 @@ class AnyGazeField:
         raise NotImplementedError
 
     @classmethod
-    def from_arrays(cls, architecture: dict, box: AnyBox, arrays: Arrays) -> AnyGazeField:
+    def from_arrays(cls, architecture: dict, box: AnyBox, arrays: Arrays) -> GazeNetwork:
         """The field with this ``architecture()`` and the ``arrays`` of a checkpoint."""
         raise NotImplementedError
 
@@ -312,7 +312,7 @@ def check_choices(config: GazeHeadConfig, **words: tuple[str, ...]) -> None:
             )
 
 
-class GazeHead(AnyGazeField):
+class GazeHead(GazeNetwork):
     """Base of a gaze field with a single density: attributes are an encoding ``grid``, plain arrays ``ARRAYS`` and
     networks ``NETS``. A subclass defines how it is constructed and its ``unnormalized`` density."""
 
@@ -435,9 +435,9 @@ class GazeHead(AnyGazeField):
 
 # ---- Registry of gaze fields by their names in checkpoints ----
 
-Kind = TypeVar("Kind", bound=type[AnyGazeField])
+Kind = TypeVar("Kind", bound=type[GazeNetwork])
 
-_KINDS: dict[str, type[AnyGazeField]] = {}
+_KINDS: dict[str, type[GazeNetwork]] = {}
 
 
 def register(cls: Kind) -> Kind:
@@ -451,7 +451,7 @@ def kinds() -> tuple[str, ...]:
     return tuple(_KINDS)
 
 
-def build_gaze_field(architecture: dict, box: AnyBox, arrays: Arrays) -> AnyGazeField:
+def build_gaze_field(architecture: dict, box: AnyBox, arrays: Arrays) -> GazeNetwork:
     """The gaze field with this ``architecture`` and the ``arrays`` of a checkpoint. Raises ``ValueError`` for an
     unknown kind."""
     # Checkpoints of the first version have no kind: there was only one.
@@ -523,7 +523,7 @@ def make_prior_table(density: np.ndarray, rows: int, ns: ModuleType, directions:
 
 
 @register
-class GazeEnsemble(AnyGazeField):
+class GazeEnsemble(GazeNetwork):
     """The mean of ``members``: two or more fields of one kind, variant and box. Raises ``ValueError`` if they differ in
     these.
 

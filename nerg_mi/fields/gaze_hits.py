@@ -5,8 +5,8 @@ q(r_o | p_o) = Σ_j w_j f(r_o; a_j, κ) / Σ_j w_j,  w_j = exp(-|o_j - p_o|² / 
 Sample j was recorded at o_j and hit a surface at h_j. Seen from the observer p_o, it points in the direction a_j, so
 that the kernels f (von Mises-Fisher, concentration κ) follow the parallax of the surfaces. Without the re-aiming it is
 the conditional kernel density of Rosenblatt (1969). It resolves what attracts attention as finely as the samples do,
-but says little where nobody stood nearby, where the networks of a gaze field still generalise. The mixture of both
-predicts held-out gaze better than either (docs/explanation/accuracy.md).
+but says little where nobody stood nearby, where the networks of a gaze field still generalise. A gaze field
+mixes both.
 """
 
 from __future__ import annotations

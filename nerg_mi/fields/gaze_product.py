@@ -111,7 +111,7 @@ class GazeConfig(GazeHeadConfig):
 
 
 @register
-class GazeField(GazeHead):
+class ProductHead(GazeHead):
     """Gaze density (1/sr) of an observer who looks at a surface.
 
     Positions are in the field's units inside ``box`` (outside, the features of the grid are 0).
@@ -143,26 +143,26 @@ class GazeField(GazeHead):
     def _sizes(config: GazeConfig) -> dict[str, list[int]]:
         """Layer sizes of each network."""
         head = [config.width, 1]
-        return dict(zip(GazeField.NETS, (config.position_sizes, config.direction_sizes, head, head)))
+        return dict(zip(ProductHead.NETS, (config.position_sizes, config.direction_sizes, head, head)))
 
     @staticmethod
     def _is_normalized(config: GazeConfig, name: str) -> bool:
         return config.trunk == "layernorm" and not name.endswith("head")
 
     @staticmethod
-    def random(config: GazeConfig, box: AnyBox, ns: ModuleType, seed: int = 0) -> GazeField:
+    def random(config: GazeConfig, box: AnyBox, ns: ModuleType, seed: int = 0) -> ProductHead:
         """An untrained field of backend ``ns``; equal seeds give equal weights."""
         rng = np.random.default_rng(seed)
         grid = HashGrid.random(config.grid, ns, rng)
-        is_normalized = GazeField._is_normalized
+        is_normalized = ProductHead._is_normalized
         nets = {
             name: MLP.random(sizes, ns, rng, is_normalized(config, name))
-            for name, sizes in GazeField._sizes(config).items()
+            for name, sizes in ProductHead._sizes(config).items()
         }
-        return GazeField(config, box, grid, **nets)
+        return ProductHead(config, box, grid, **nets)
 
     @classmethod
-    def from_arrays(cls, architecture: dict, box: AnyBox, arrays: Arrays) -> GazeField:
+    def from_arrays(cls, architecture: dict, box: AnyBox, arrays: Arrays) -> ProductHead:
         config = GazeConfig.from_dict(architecture)
         nets = {
             name: arrays.build_network(name, sizes, cls._is_normalized(config, name))

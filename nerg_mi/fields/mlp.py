@@ -62,17 +62,17 @@ linearly with the length of a function."""
 def evaluate_with_constants(layers: Sequence[Sequence[Sequence[float]]], x: list) -> list:
     """Outputs (list of Floats) at ``x`` (list of Floats) of a ReLU network of ``layers``: weights [output][input]."""
     if sum(len(layer) * len(layer[0]) for layer in layers) <= _MAX_INLINE_PRODUCTS:
-        return _unrolled(layers, x)
+        return _evaluate_layers(layers, x)
     Float = type(x[0])
     UInt32 = dr.uint32_array_t(Float)
     target = UInt32(0)
     # A function that is known to be the only target is inlined.
     dr.make_opaque(target)
     zero_outputs = lambda *x: (Float(0),) * len(layers[-1])
-    return list(dr.switch(target, [lambda *x: tuple(_unrolled(layers, list(x))), zero_outputs], *x))
+    return list(dr.switch(target, [lambda *x: tuple(_evaluate_layers(layers, list(x))), zero_outputs], *x))
 
 
-def _unrolled(layers: Sequence[Sequence[Sequence[float]]], x: list) -> list:
+def _evaluate_layers(layers: Sequence[Sequence[Sequence[float]]], x: list) -> list:
     for i, layer in enumerate(layers):
         sums = []
         for row in layer:
@@ -205,12 +205,15 @@ class MLP:
         # Cooperative vectors do not sum the gradients of a broadcast lane.
         width = max(dr.width(c) for c in x)
         x = [c + dr.zeros(ns.Float, width) if dr.width(c) < width else c for c in x]
-        if self.has_constant_weights and self._may_be_constant(x, ns):
+        # Not on CUDA, with layer normalisation, in a recording, or with gradients.
+        if self.has_constant_weights and not (
+            half or self.norms is not None or dr.flag(dr.JitFlag.FreezingScope) or dr.grad_enabled(self.weights, x)
+        ):
             if self._constants is None:
                 self._constants = [w.numpy().tolist() for w in self.weights]
             return evaluate_with_constants(self._constants, x)
         if self.norms is not None:
-            return self._normalized(x, ns, half)
+            return self._evaluate_normalized(x, ns, half)
         views: Any = self._views
         v = nn.CoopVec(*([ns.Float16(c) for c in x] if half else x))
         for i, view in enumerate(views):
@@ -220,13 +223,7 @@ class MLP:
         out = list(v)
         return [ns.Float(c) for c in out] if half else out
 
-    def _may_be_constant(self, x: list, ns: ModuleType) -> bool:
-        """Whether constant weights are possible: no gradients, recording, CUDA or layer normalisation."""
-        if is_cuda(ns) or self.norms is not None or dr.flag(dr.JitFlag.FreezingScope):
-            return False
-        return not dr.grad_enabled(self.weights, x)
-
-    def _normalized(self, x: list, ns: ModuleType, half: bool) -> list:
+    def _evaluate_normalized(self, x: list, ns: ModuleType, half: bool) -> list:
         for i in range(len(self.weights)):
             if i > 0:
                 x = [dr.maximum(c, 0) for c in x]
@@ -278,6 +275,69 @@ def _append_zeros(w: Any, inputs: int) -> Any:
 def _fold_norm(w, norm: dict[str, Any]) -> tuple:
     """Weights and bias of a layer with the gain and shift of its inputs folded in."""
     return w * norm["gain"], norm["bias"] + dr.sum(w * norm["shift"], axis=1)
+
+
+# ---- Rows of a batch as a matrix, and back ----
+
+
+def stack(rows: list, ns):
+    """Stack rows (Floats of one length, or constants) to a TensorXf (N, columns).
+
+    Columns of zeros follow up to a multiple of eight, which Dr.Jit stores at once.
+    """
+    return dr.custom(_Stack, [*rows, *[ns.Float(0)] * (-len(rows) % 8)], ns)
+
+
+def unstack(x, ns) -> list:
+    """Split a TensorXf (N, columns) into its columns as Floats."""
+    return dr.custom(_Unstack, x, ns)
+
+
+class _Stack(dr.CustomOp):
+    """Dr.Jit's own derivative would load one number at a time, and that of `_Unstack` add one atomically."""
+
+    def eval(self, rows, ns):
+        self.ns = ns
+        return _join(rows, ns)
+
+    def forward(self):
+        self.set_grad_out(_join(self.grad_in("rows"), self.ns))
+
+    def backward(self):
+        self.set_grad_in("rows", _split(self.grad_out(), self.ns))
+
+    def name(self):
+        return "stack of rows"
+
+
+class _Unstack(dr.CustomOp):
+    """Inverse of `_Stack`."""
+
+    def eval(self, x, ns):
+        self.ns = ns
+        return _split(x, ns)
+
+    def forward(self):
+        self.set_grad_out(_split(self.grad_in("x"), self.ns))
+
+    def backward(self):
+        self.set_grad_in("x", _join(self.grad_out(), self.ns))
+
+    def name(self):
+        return "columns of a matrix"
+
+
+def _join(rows: Any, ns):
+    columns = ns.ArrayXf(rows)
+    # Dr.Jit aborts if it stores several numbers at once of which one awaits additions.
+    dr.eval([x for x in columns if x.state == dr.VarState.Dirty])
+    flat = dr.ravel(columns, order="F")
+    return ns.TensorXf(flat, (dr.width(flat) // len(rows), len(rows)))
+
+
+def _split(x, ns) -> list:
+    width, rows = x.shape
+    return list(dr.gather(ns.ArrayXf, x.array, dr.arange(ns.UInt32, width), shape=(rows, width)))
 
 
 def set_constant_weights(field: Any, enabled: bool = True) -> None:

@@ -14,7 +14,7 @@ from nerg_mi.maths.types import Array3f, Bool, Float, UInt32
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-    from .radiance import RadianceField
+    from .radiance import RadianceNetwork
 
 # ---- Occupancy ----
 #
@@ -115,9 +115,9 @@ def chessboard_distance(bits: np.ndarray) -> np.ndarray:
     *_, n = bits.shape
     wide = np.zeros((*bits.shape[:-1], -(-n // 64) * 64), bool)
     wide[..., :n] = True
-    inside = _words(wide)
+    inside = _to_words(wide)
     wide[..., :n] = bits
-    reached, planes = _words(wide), []
+    reached, planes = _to_words(wide), []
     for _ in range(_FAR):
         carry = inside & ~reached
         if not carry.any():
@@ -135,7 +135,7 @@ def chessboard_distance(bits: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(distance[..., :n])
 
 
-def _words(cells: np.ndarray) -> np.ndarray:
+def _to_words(cells: np.ndarray) -> np.ndarray:
     """Rows of ``cells`` (bool, a multiple of 64 in the last axis) as words, lowest bit first."""
     return np.packbits(cells, axis=-1, bitorder="little").view("<u8")
 
@@ -210,7 +210,7 @@ class CascadeGrid(_Bits):
                 f"cascades of {r} cells to a bound of {bound} need {self.cells[0]} equal cells along an edge; "
                 f"float32 distinguishes at most {_MAX_CELLS}"
             )
-        self.distance = ns.UInt8(np.stack(self._distances()).ravel())
+        self.distance = ns.UInt8(np.stack(self._compute_distances()).ravel())
 
     @property
     def resolution(self) -> int:
@@ -233,14 +233,14 @@ class CascadeGrid(_Bits):
         inside = (edges[:-1] >= -half) & (edges[1:] <= half)
         return inside[:, None, None] & inside[:, None] & inside
 
-    def _distances(self) -> list[np.ndarray]:
+    def _compute_distances(self) -> list[np.ndarray]:
         """For each level, chessboard distances in its own cells to cells that are occupied or outside the level; 0:
         occupied."""
         out, finer, inner = [], None, 0.0
         for level, bits in enumerate(self.bits):
             full = bits & ~self._within(level, inner)
             if finer is not None:
-                full |= self._coarsened(finer, level)
+                full |= self._coarsen(finer, level)
             last = level + 1 == len(self.bits)
             # Cells around a level are not known to be empty, except around the last one.
             padded = np.pad(full, 1, constant_values=not last)
@@ -249,7 +249,7 @@ class CascadeGrid(_Bits):
             finer, inner = full, self._halves[level]
         return out
 
-    def _coarsened(self, finer: np.ndarray, level: int) -> np.ndarray:
+    def _coarsen(self, finer: np.ndarray, level: int) -> np.ndarray:
         """Cells of ``level`` that overlap an occupied cell of the previous level."""
         r, small, large = self.resolution, self._ratios[level - 1], self._ratios[level]
         first = (np.arange(r) * small + r // 2 * (large - small)) // large
@@ -320,18 +320,18 @@ def cascades_from_contracted(
     r, levels = resolution or len(bits), count_cascade_levels(outer_scale)
     out = np.zeros((levels, r, r, r), bool)
     if bits.any():
-        lower, upper = _preimages(bits, outer_scale)
+        lower, upper = _expand_cells(bits, outer_scale)
         for level in range(levels):
             # In cells of this level; touching is not overlapping.
             scale, shift = r / 2.0 ** (level + 1), r / 2
             first = np.floor(lower * scale + shift + 1e-4).astype(int)
             last = np.ceil(upper * scale + shift - 1e-4).astype(int) - 1
             meets = np.all((last >= 0) & (first < r), axis=1)
-            _mark(out[level], np.clip(first[meets], 0, r - 1), np.clip(last[meets], 0, r - 1))
+            _mark_boxes(out[level], np.clip(first[meets], 0, r - 1), np.clip(last[meets], 0, r - 1))
     return CascadeGrid(out, outer_scale, ns, threshold)
 
 
-def _preimages(bits: np.ndarray, outer_scale: float) -> tuple[np.ndarray, np.ndarray]:
+def _expand_cells(bits: np.ndarray, outer_scale: float) -> tuple[np.ndarray, np.ndarray]:
     """Bounding boxes (N, 3), lower and upper corners in half edges of the inner cube, of the contracted cells
     ``bits``."""
     r = len(bits)
@@ -350,7 +350,7 @@ def _preimages(bits: np.ndarray, outer_scale: float) -> tuple[np.ndarray, np.nda
     return np.clip(lower, -outer_scale, outer_scale), np.clip(upper, -outer_scale, outer_scale)
 
 
-def _mark(cells: np.ndarray, first: np.ndarray, last: np.ndarray) -> None:
+def _mark_boxes(cells: np.ndarray, first: np.ndarray, last: np.ndarray) -> None:
     """Set the ``cells`` [z, y, x] of boxes of cells, from ``first`` (N, 3; x, y, z) to ``last``, inclusive."""
     # Signs at the eight corners of each box, summed along the axes: the work does not depend on the size of the boxes.
     count = np.zeros(np.add(cells.shape, 1), np.int32)
@@ -480,7 +480,7 @@ _GROWTH = 1.2207440846057596  # The root of x⁴ = x + 1, whose powers are the s
 _SAMPLES = 1 << 17
 
 
-def refine_occupancy(field: RadianceField, points: int = POINTS_PER_PART) -> RefinedGrid | None:
+def refine_occupancy(field: RadianceNetwork, points: int = POINTS_PER_PART) -> RefinedGrid | None:
     """The refined occupancy of ``field`` for its current weights; None if its occupancy is not a plain grid.
 
     A density counts if its optical depth per step exceeds ``MIN_STEP_OPTICAL_DEPTH``; the step is the field's own, or
@@ -496,12 +496,12 @@ def refine_occupancy(field: RadianceField, points: int = POINTS_PER_PART) -> Ref
     ns = field.ns
     with dr.suspend_grad():
         cells = ns.UInt32(copy_aligned(np.flatnonzero(grid.bits), np.uint32))
-        masks = _masks(field, grid.bits, cells, threshold, points)
-        missed = _missed(field, cells, ns.UInt32(copy_aligned(masks, np.uint32)), grid.resolution, step)
+        masks = _find_masks(field, grid.bits, cells, threshold, points)
+        missed = _estimate_missed_depth(field, cells, ns.UInt32(copy_aligned(masks, np.uint32)), grid.resolution, step)
     return RefinedGrid(grid.bits, masks, ns, threshold, grid.threshold, missed)
 
 
-def _masks(field: RadianceField, bits: np.ndarray, cells: UInt32, threshold: float, points: int) -> np.ndarray:
+def _find_masks(field: RadianceNetwork, bits: np.ndarray, cells: UInt32, threshold: float, points: int) -> np.ndarray:
     """Masks (uint8, (N,)) of the parts of ``bits`` (R, R, R), with the N occupied ``cells``, whose density exceeds
     ``threshold`` at one of the ``points``."""
     ns, count, resolution = field.ns, PARTS_PER_AXIS**3, len(bits)
@@ -510,7 +510,7 @@ def _masks(field: RadianceField, bits: np.ndarray, cells: UInt32, threshold: flo
     occupied, near = (dr.zeros(ns.UInt8, count * dr.width(cells)) for _ in range(2))
     for k in range(points):
         if k == _FIRST:
-            near |= ns.UInt8(_touching(bits, _packed(occupied)))
+            near |= ns.UInt8(_find_touching_parts(bits, _pack_masks(occupied)))
         remaining = cast("UInt32", dr.compress((occupied == 0) & (near > 0) if k >= _FIRST else occupied == 0))
         if dr.width(remaining) == 0:
             break
@@ -523,15 +523,15 @@ def _masks(field: RadianceField, bits: np.ndarray, cells: UInt32, threshold: flo
         dr.scatter(occupied, ns.UInt8(1), remaining, sigma > threshold)
         dr.scatter(near, ns.UInt8(1), remaining, sigma > _EMPTY_FRACTION * threshold)
         dr.eval(occupied, near)
-    return _packed(occupied)
+    return _pack_masks(occupied)
 
 
-def _packed(occupied: Any) -> np.ndarray:
+def _pack_masks(occupied: Any) -> np.ndarray:
     """Masks of cells from one UInt8 per part, positive for ``occupied`` parts."""
     return np.packbits(occupied.numpy().reshape(-1, PARTS_PER_AXIS**3) > 0, axis=1, bitorder="little").ravel()
 
 
-def _touching(bits: np.ndarray, masks: np.ndarray) -> np.ndarray:
+def _find_touching_parts(bits: np.ndarray, masks: np.ndarray) -> np.ndarray:
     """Whether each part of the occupied cells of ``bits`` is one of ``masks`` or touches one: uint8, flattened. A
     surface through one part can cut a corner of the next."""
     part_indices = np.argwhere(bits)[:, None] * PARTS_PER_AXIS + np.array(
@@ -543,7 +543,7 @@ def _touching(bits: np.ndarray, masks: np.ndarray) -> np.ndarray:
     return dilate(occupied)[z, y, x].astype(np.uint8)
 
 
-def _missed(field: RadianceField, cells: UInt32, masks: UInt32, resolution: int, step: float) -> float:
+def _estimate_missed_depth(field: RadianceNetwork, cells: UInt32, masks: UInt32, resolution: int, step: float) -> float:
     """Mean optical depth along random lines through the box of the density in ``cells`` outside the parts of ``masks``.
 
     By Cauchy's formula (Santaló 1976) it is 4 / S times the integral of the density, with the surface area S of the

@@ -249,7 +249,7 @@ def density_from_log(h, scale: float):
     return scale * dr.exp(dr.minimum(h, _MAX_LOG_DENSITY))
 
 
-class RadianceField:
+class RadianceNetwork:
     """Density (1/unit) and colour at points of ``box``.
 
     Raises ``ValueError`` for parts that do not match ``config``.
@@ -312,10 +312,10 @@ class RadianceField:
         self.occupancy = occupancy
 
     @staticmethod
-    def random(config: RadianceConfig, box: AnyBox, ns: ModuleType, seed: int = 0, **kwargs) -> RadianceField:
+    def random(config: RadianceConfig, box: AnyBox, ns: ModuleType, seed: int = 0, **kwargs) -> RadianceNetwork:
         """An untrained field of backend ``ns``; equal seeds give equal weights."""
         rng = np.random.default_rng(seed)
-        return RadianceField(
+        return RadianceNetwork(
             config,
             box,
             HashGrid.random(config.grid, ns, rng),

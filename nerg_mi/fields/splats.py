@@ -65,7 +65,7 @@ class Splats:
         for name in ("centers", "scales"):
             if not (np.abs(getattr(self, name)) <= MAX_COORDINATE).all():
                 raise ValueError(f"some of the {name} of its Gaussians are beyond {MAX_COORDINATE:g} units")
-        object.__setattr__(self, "rotations", _normalized(self.rotations))
+        object.__setattr__(self, "rotations", _normalize_quaternions(self.rotations))
         object.__setattr__(self, "opacities", np.clip(self.opacities, 0, 1))
         if self.scales.min() < _MIN_SCALE:
             object.__setattr__(self, "scales", np.maximum(self.scales, np.float32(_MIN_SCALE)))
@@ -94,7 +94,7 @@ class Splats:
         return quaternions_to_matrices(self.rotations)
 
 
-def _normalized(rotations: np.ndarray) -> np.ndarray:
+def _normalize_quaternions(rotations: np.ndarray) -> np.ndarray:
     """Quaternions (N, 4) normalised to length 1. Raises `ValueError` for a quaternion of length 0."""
     unit = np.empty_like(rotations)
     # In blocks: in double precision all of them would take more memory than the Gaussians.

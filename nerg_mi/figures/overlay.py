@@ -14,6 +14,7 @@ from nerg_mi.maths.color import encode_srgb
 from nerg_mi.ranges import LOG_DECADES
 from nerg_mi.transport.aovs import AOVS, Aov, Display, Quantity
 
+from .settings import Style
 from .style import SMALL, Sheet, apply_colormap, find_colormap, hatch
 
 # ---- Colour conversion ----
@@ -448,17 +449,6 @@ class OverlayLayers:
     support_note: str = ""
 
 
-@dataclass(frozen=True)
-class Style:
-    """Appearance of an overlay: colour map (None: default), ``decades`` of a logarithmic scale (0: linear), whether
-    unknown pixels are hatched, and ``title`` (None: default)."""
-
-    colormap: str | None = None
-    decades: float = 0.0
-    hatch_unknown: bool = True
-    title: str | None = None
-
-
 DEFAULT_STYLE = Style()
 
 
@@ -503,6 +493,11 @@ class Overlay:
         """Whether the scale is defined by its upper end alone."""
         return self.display.kind in ("heat", "diverging")
 
+    def check_style(self, style: Style) -> None:
+        """Raise `NergError` for a colour map that does not exist, or does not suit the values."""
+        if style.cmap is not None:
+            find_colormap(style.cmap, self.colormap_kind)
+
     def limits(self, layers: OverlayLayers) -> Limits:
         """Return the lower and upper end of the colour scale of the image ``layers``, from its values on surfaces.
 
@@ -526,7 +521,7 @@ class Overlay:
 
     def paint(self, layers: OverlayLayers, limits: Limits, style: Style = DEFAULT_STYLE, unknown=None) -> np.ndarray:
         """Return display values (h, w, 3); pixels in ``unknown`` (h, w) are hatched."""
-        kind, colors = self.display.kind, style.colormap or self.default_colormap
+        kind, colors = self.display.kind, style.cmap or self.default_colormap
         if kind == "heat":
             return overlay(layers.color, layers.values, self.heat(limits, style), layers.mask, unknown)
         if kind == "shade":
@@ -547,7 +542,7 @@ class Overlay:
         if self.display.kind == "heat":
             if style.title is None and needs_support and not layers.has_support:
                 title = f"{title}: no samples near this observer"
-            unknown = unknown_mask(layers, needs_support) if style.hatch_unknown else None
+            unknown = unknown_mask(layers, needs_support) if style.hatching else None
             heat = self.heat(limits, style)
             return gaze_figure(
                 layers.color,
@@ -588,7 +583,7 @@ class Overlay:
             values = np.concatenate([layers.values[layers.mask & np.isfinite(layers.values)] for layers in all_layers])
             color_limits = self._color_limits(values, np.ones(values.shape, bool), limits)
             add_map_scale(
-                sheet, color_limits, style.colormap or self.default_colormap, self.colormap_kind, label, values, unknown
+                sheet, color_limits, style.cmap or self.default_colormap, self.colormap_kind, label, values, unknown
             )
 
     def check_limits(self, limits: Limits) -> None:
@@ -602,7 +597,7 @@ class Overlay:
     def heat(self, limits: Limits, style: Style = DEFAULT_STYLE) -> Heat:
         """Return the appearance of a heat map with the given limits."""
         return Heat(
-            1.0 if limits is None else limits[1], style.colormap or self.default_colormap, decades=style.decades
+            1.0 if limits is None else limits[1], style.cmap or self.default_colormap, decades=style.log_decades
         )
 
     def _color_limits(self, values, mask, limits: Limits) -> tuple[float, float]:

@@ -12,7 +12,7 @@ import re
 import sys
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -21,6 +21,8 @@ import numpy as np
 from nerg_mi import __version__
 from nerg_mi.errors import NergError, clean_text
 from nerg_mi.files.atomic import check_writable, file_sha256, write_bytes
+from nerg_mi.files.values import to_path
+from nerg_mi.progress import Reporter, is_notebook
 
 # ---- Colour maps ----
 #
@@ -169,7 +171,7 @@ def make_provenance(
 def _input_digest(path: Path) -> str:
     if not path.is_dir():
         return file_sha256(path)
-    from nerg_mi.rays.dataset import hash_rays
+    from nerg_mi.tracking.dataset import hash_rays
 
     return hash_rays(path)
 
@@ -203,10 +205,15 @@ def _changed_options(settings: Any) -> dict[str, Any]:
 
 
 def changed_arguments(function: Callable[..., Any], values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the ``values`` of settings (keywords) of ``function`` that are neither None nor the default, by name."""
+    """Return the ``values`` of settings (keywords) of ``function`` that are neither None nor the default, by name.
+
+    Settings in dataclasses are listed individually."""
     keywords = [p for p in inspect.signature(function).parameters.values() if p.kind is p.KEYWORD_ONLY]
-    settings = {p.name: p.default for p in keywords if p.name not in ("output", "progress")}
-    return {k: values[k] for k, default in settings.items() if values[k] is not None and values[k] != default}
+    settings = {p.name: p.default for p in keywords if p.name not in ("output", "parallel", "progress")}
+    is_changed = lambda value, default: value is not None and (default is None or value != default)
+    changed = {name: values[name] for name, default in settings.items() if is_changed(values[name], default)}
+    nested = [changed.pop(name) for name, default in settings.items() if is_dataclass(default) and name in changed]
+    return changed | {name: value for part in nested for name, value in _changed_options(part).items()}
 
 
 def _to_json(value: Any) -> Any:
@@ -254,6 +261,17 @@ def figure_of(drawn: Any) -> Any:
     return first if hasattr(first, "savefig") else first.get_figure(root=True)
 
 
+def show_figure(figure: Any) -> Any:
+    """Return a new ``figure``, made the current one of pyplot, if that is imported, for its ``savefig`` and ``show``.
+
+    A notebook shows what a cell returns, and would show the figure twice.
+    """
+    pyplot = sys.modules.get("matplotlib.pyplot")
+    if pyplot is not None and not is_notebook():
+        pyplot.figure(FigureClass=lambda **_: figure)
+    return figure
+
+
 def save(drawn: Any, path: str | os.PathLike, metadata: Provenance | Mapping[str, str] | None = None) -> None:
     """Write a matplotlib figure as .png, or as .svg or .pdf with embedded images and text as text.
 
@@ -269,6 +287,29 @@ def save(drawn: Any, path: str | os.PathLike, metadata: Provenance | Mapping[str
     check_writable(path, *FORMATS)
     text = dict(metadata.text() if isinstance(metadata, Provenance) else metadata or {})
     write_bytes(path, encode(drawn, Path(path).suffix.lower(), text))
+
+
+def check_figure(output: str | os.PathLike | None) -> None:
+    """Raise `NergError` if a figure evidently cannot be written to ``output``, unless that is None."""
+    if output is not None:
+        check_writable(to_path(output), *FORMATS)
+
+
+def finish_figure(
+    drawn: Any,
+    output: str | os.PathLike | None,
+    what: str,
+    inputs: Iterable[str | Path],
+    seed: int | None,
+    settings: Mapping[str, Any],
+    reporter: Reporter,
+) -> Any:
+    """Write a new figure with its provenance (`make_provenance`) unless ``output`` is None, and return it to show."""
+    figure = figure_of(drawn)
+    if output is not None:
+        save(figure, output, make_provenance(what, inputs, seed, settings))
+        reporter.message(f"Wrote {output} ({' x '.join(f'{v:.0f}' for v in figure.bbox.size)}).")
+    return show_figure(figure)
 
 
 def encode(drawn: Any, suffix: str, text: Mapping[str, str] | None = None) -> bytes:

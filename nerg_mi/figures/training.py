@@ -42,7 +42,7 @@ def psnr_figure(history: Sequence[dict], result: dict | None = None, axes: Any =
         values = np.array([row.get(key) for row in history], float)
         axes.plot(seconds, values, "o-", color=color, label=label, markersize=4, linewidth=1.5)
     if result is not None:
-        label = f"written state: step {result['steps']}, {result['psnr']:.2f} dB on held-out views"
+        label = f"written state: step {result['steps']}, {result['psnr']:.2f} dB on these held-out views"
         axes.axvline(result["seconds"], color=INK, linewidth=0.8, linestyle=":")
         axes.plot(
             [result["seconds"]], [result["psnr"]], "*", color=INK, markersize=13, markerfacecolor="white", label=label

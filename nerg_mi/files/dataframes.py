@@ -113,17 +113,24 @@ class ResultTables:
 
     def _repr_html_(self) -> str:
         """The main table, for notebooks."""
-        rows = getattr(self, self._main_table())
-        names = list(dict.fromkeys(key for row in rows[:_MAX_SHOWN_ROWS] for key in row))
-        # Columns without any value say nothing.
-        names = [name for name in names if any(row.get(name) not in (None, "") for row in rows[:_MAX_SHOWN_ROWS])]
-        numeric = [i for i, name in enumerate(names) if any(isinstance(row.get(name), float) for row in rows)]
-        cells = [[_format_cell(row.get(name)) for name in names] for row in rows[:_MAX_SHOWN_ROWS]]
-        note = f"{len(rows):,} rows, of which {_MAX_SHOWN_ROWS} are shown" if len(rows) > _MAX_SHOWN_ROWS else None
-        return html.markup([html.table(names, cells, numeric), html.paragraph(note) if note else None])
+        return rows_to_html(getattr(self, self._main_table()))
 
 
 _MAX_SHOWN_ROWS = 60
+
+
+def rows_to_html(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return an HTML table of the first ``rows``, for notebooks; columns without values are left out."""
+    shown = rows[:_MAX_SHOWN_ROWS]
+    names = [name for name in dict.fromkeys(key for row in shown for key in row) if _has_values(shown, name)]
+    numeric = [i for i, name in enumerate(names) if any(isinstance(row.get(name), float) for row in rows)]
+    cells = [[_format_cell(row.get(name)) for name in names] for row in shown]
+    note = f"{len(rows):,} rows, of which {_MAX_SHOWN_ROWS} are shown" if len(rows) > _MAX_SHOWN_ROWS else None
+    return html.markup([html.table(names, cells, numeric), html.paragraph(note) if note else None])
+
+
+def _has_values(rows: Sequence[Mapping[str, Any]], name: str) -> bool:
+    return any(row.get(name) not in (None, "") for row in rows)
 
 
 def _format_cell(value: Any) -> Any:
@@ -150,9 +157,11 @@ class DataFrameReader:
     """
 
     def __init__(self, frame: Any) -> None:
+        self._index: list[Any] = []  # names of the index of pandas, which is no column
         if hasattr(frame, "iloc") and hasattr(frame, "columns"):
             # pandas allows repeated names and tuples, which narwhals refuses even in unused columns.
             self._labels, self._get = list(frame.columns), lambda k: frame.iloc[:, k]
+            self._index = list(getattr(frame.index, "names", ()))
         elif hasattr(frame, "column_names") and hasattr(frame, "combine_chunks"):
             # So does Arrow.
             self._labels, self._get = list(frame.column_names), frame.column
@@ -182,8 +191,14 @@ class DataFrameReader:
             text = fold_name(_format_label(name))
             matches = [k for k, label in enumerate(self.names) if fold_name(label) == text]
         if not matches:
+            is_index = any(_is_same(label, name) for label in self._index)
             raise NergError(
-                f'the data frame has no column "{_format_label(name)}"; it has {", ".join(self.names) or "none"}'
+                f'the data frame has no column "{_format_label(name)}"; '
+                + (
+                    "its index has this name: use reset_index()"
+                    if is_index
+                    else f"it has {', '.join(self.names) or 'none'}"
+                )
             )
         if len(matches) > 1:
             raise NergError(

@@ -7,7 +7,10 @@ from __future__ import annotations
 
 import base64
 import html
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
 
 from nerg_mi.errors import spell_parameters
 
@@ -93,3 +96,59 @@ def image(png: bytes, alt: str, kind: str | None = None) -> Html:
 def figure(content: Html, caption: Content) -> Html:
     """Return ``content`` with a caption below it."""
     return element("figure", content, element("figcaption", caption))
+
+
+# ---- Objects in notebooks ----
+
+_MAX_SHOWN_VALUES = 8
+_MAX_SHOWN_TEXT = 120
+
+
+class Summary:
+    """Base of dataclasses that consoles show as one line of their attributes, and notebooks as a table of them."""
+
+    def __repr__(self) -> str:
+        facts = ", ".join(f"{name} {value}" for name, value in _describe_values(_get_attributes(self)))
+        return f"<{type(self).__name__}: {facts}>"
+
+    def _repr_html_(self) -> str:
+        return summary_table(_get_attributes(self))
+
+
+def _get_attributes(value: Any) -> dict[str, Any]:
+    return {f.name: getattr(value, f.name) for f in fields(value) if not f.name.startswith("_")}
+
+
+def summary_table(values: Mapping[str, Any]) -> Html:
+    """Return a table of named values: sizes of arrays and containers, and text of others; empty ones are left out."""
+    return key_value_table(_describe_values(values))
+
+
+def _describe_values(values: Mapping[str, Any]) -> list[tuple[str, str]]:
+    texts = {name.replace("_", " "): _describe_value(value) for name, value in values.items()}
+    return [(name, text) for name, text in texts.items() if text]
+
+
+def _describe_value(value: Any) -> str:
+    import numpy as np  # help, which shows no values, does without it
+
+    if value is None or isinstance(value, (str, Path)):
+        return "" if value is None else value.name if isinstance(value, Path) else value
+    if isinstance(value, np.ndarray):
+        return f"{' x '.join(f'{size:,}' for size in value.shape)} {value.dtype}"
+    if isinstance(value, (Mapping, list, tuple, set, frozenset)):
+        return _describe_container(value)
+    if isinstance(value, (bool, int, float, np.generic)):
+        return f"{value:.4g}" if isinstance(value, (float, np.floating)) else str(value)
+    text = repr(value)
+    return text if len(text) <= _MAX_SHOWN_TEXT and "\n" not in text else type(value).__name__
+
+
+def _describe_container(value: Mapping[Any, Any] | Iterable[Any]) -> str:
+    """Return a few numbers and words, and the number of others."""
+    entries = list(value)
+    items = [value[key] for key in entries] if isinstance(value, Mapping) else entries
+    if len(items) > _MAX_SHOWN_VALUES or not all(isinstance(x, (str, int, float, Path)) for x in items):
+        return f"{len(items):,} {'entry' if len(items) == 1 else 'entries'}" if items else ""
+    texts = map(_describe_value, items)
+    return ", ".join(map(" ".join, zip(map(str, entries), texts)) if isinstance(value, Mapping) else texts)

@@ -93,7 +93,7 @@ def translate_read_errors(
     except FileNotFoundError as error:
         raise MissingFile(f'there is no {file_kind} "{path}"; correct its name') from error
     except (*_DAMAGE_ERRORS, *extra_errors) as error:
-        reason = f"cannot be read: {describe_error(error)}; {_choose_remedy(error, remedy)}"
+        reason = f"cannot be read: {_add_remedy(error, remedy)}"
         raise NergError(f'the {file_kind} "{path}" {find_other_content(path) or reason}') from error
     except Exception as error:
         # Compared by name, so that safetensors is not imported here.
@@ -111,12 +111,19 @@ _OTHER_CONTENT = {
     b"BZh": "is compressed with bzip2; decompress it",
     b"\xfd7zXZ": "is compressed with xz; decompress it",
     b"\x28\xb5\x2f\xfd": "is compressed with Zstandard; decompress it",
+    b"PK\x03\x04": "is a zip archive or an Excel workbook; extract it, or export its table as CSV",
+    b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1": "is an Excel workbook; export its table as CSV",
+    b"PAR1": "is a Parquet table; give it a name that ends in .parquet",
+    b"SQLite format 3": "is a database; export its table as CSV",
+    b"%PDF": "is a PDF; export its content in the needed format",
 }
+# Formats that begin like one of these.
+_COMPRESSED_SUFFIXES = (".gz", ".spz", ".npz", ".sog", ".pth", ".pt", ".parquet")
 
 
 def find_other_content(path: str | os.PathLike) -> str | None:
     """Return what a file that cannot be read is instead, with the remedy; None if that is unknown."""
-    if str(path).lower().endswith((".gz", ".spz")) or not os.path.isfile(path):
+    if str(path).lower().endswith(_COMPRESSED_SUFFIXES) or not os.path.isfile(path):
         return None
     try:
         with open(path, "rb") as file:
@@ -177,12 +184,18 @@ def _has_raise_statement(error: BaseException) -> bool:
     return trace.tb_lasti < len(code) and code[trace.tb_lasti] == dis.opmap["RAISE_VARARGS"]
 
 
-def _choose_remedy(error: BaseException, remedy: str) -> str:
+_OWN_REMEDY = re.compile(r"; (convert|export|save) ")
+
+
+def _add_remedy(error: BaseException, remedy: str) -> str:
+    """Return what is wrong with a file whose reading raised ``error``, with the remedy: the error's own if it names
+    one."""
     if isinstance(error, PermissionError):
-        return "change its permissions"
+        remedy = "change its permissions"
     if isinstance(error, (IsADirectoryError, NotADirectoryError)):
-        return "specify a file"
-    return remedy
+        remedy = "specify a file"
+    text = describe_error(error)
+    return text if _OWN_REMEDY.search(text) else f"{text}; {remedy}"
 
 
 _FILE_KINDS = {

@@ -11,7 +11,7 @@ import math
 import os
 import re
 import unicodedata
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, KeysView, Sequence, ValuesView
 from numbers import Real
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -95,6 +95,9 @@ def _to_array(values: Any, name: str) -> tuple[np.ndarray, np.ndarray | None]:
     if hasattr(values, "detach") and hasattr(values, "cpu"):
         # Tensors of PyTorch that have derivatives, or are on another device.
         values = values.detach().cpu()
+        values = values.double() if values.is_floating_point() else values  # NumPy lacks bfloat16
+    if isinstance(values, (Iterator, ValuesView, KeysView)):
+        values = list(values)
     try:
         return np.asarray(values), None
     except (TypeError, ValueError, OverflowError) as error:
@@ -103,7 +106,7 @@ def _to_array(values: Any, name: str) -> tuple[np.ndarray, np.ndarray | None]:
 
 def _fill(array: np.ndarray, missing: np.ndarray | None, dtype: DTypeLike) -> np.ndarray:
     if missing is None or not missing.any():
-        return np.ascontiguousarray(array, dtype)
+        return np.asarray(array, dtype, order="C")
     return np.where(missing, np.nan, array).astype(dtype)
 
 

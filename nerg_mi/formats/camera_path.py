@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import os
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from nerg_mi.errors import NergError, sanitize
-from nerg_mi.files.atomic import write_text
 from nerg_mi.files.safe_read import read_json, translate_read_errors
 from nerg_mi.files.schema import NUMBER, Items, Number, check_json
 from nerg_mi.maths.transforms import check_rigid_transforms, correct_rotation
@@ -77,23 +74,3 @@ def read_camera_path(path: str | os.PathLike) -> CameraPath:
         width, height = int(data["render_width"]), int(data["render_height"])
         fps = float(data.get("fps", 24))
     return CameraPath(to_world, fov, width, height, fps)
-
-
-def write_camera_path(output: str | os.PathLike, path: CameraPath) -> None:
-    """Write ``path`` to the file ``output`` (.json), which ``ns-render camera-path`` reads."""
-    aspect = path.width / path.height
-    frames = [
-        {"camera_to_world": pose.ravel().tolist(), "fov": float(fov), "aspect": aspect}
-        for pose, fov in zip(np.asarray(path.to_world, float), path.fov)
-    ]
-    data = {
-        "camera_type": "perspective",
-        "render_width": path.width,
-        "render_height": path.height,
-        "fps": path.fps,
-        "seconds": len(frames) / path.fps,
-        "is_cycle": False,
-        "crop": None,
-        "camera_path": frames,
-    }
-    write_text(Path(output), json.dumps(data))

@@ -52,7 +52,7 @@ class ExchangePoints:
 class ExchangeRays:
     """Gaze of a participant over time: ``times`` (N,) in seconds, ascending, ``origins`` and ``ends`` (N, 3).
 
-    ``tracking`` tells what the directions are, as `nerg_mi.rays.rays.TRACKING`.
+    ``tracking`` tells what the directions are, as `nerg_mi.tracking.rays.TRACKING`.
     """
 
     participant: str

@@ -17,7 +17,7 @@ from nerg_mi.errors import NergError, parameter, sanitize
 from nerg_mi.fields.encoding import HashGrid, HashGridConfig
 from nerg_mi.fields.gaze_base import (
     MAX_WEIGHT,
-    AnyGazeField,
+    GazeNetwork,
     RaySupport,
     build_gaze_field,
     max_sizes_of,
@@ -26,7 +26,7 @@ from nerg_mi.fields.gaze_base import (
 from nerg_mi.fields.gaze_hits import ReaimedHits
 from nerg_mi.fields.mlp import MLP
 from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid, RefinedGrid, unpack_bits
-from nerg_mi.fields.radiance import EMPTY, Background, BackgroundConfig, RadianceConfig, RadianceField
+from nerg_mi.fields.radiance import EMPTY, Background, BackgroundConfig, RadianceConfig, RadianceNetwork
 from nerg_mi.fields.voxels import VoxelArrays, VoxelGrid
 from nerg_mi.files.atomic import file_sha256
 from nerg_mi.files.safe_read import describe_error
@@ -281,7 +281,7 @@ def _decode_voxels(arrays: StoredArrays, config: dict) -> VoxelGrid:
 
 
 def save_radiance(
-    field: RadianceField, path: str | Path, provenance: dict, half: bool = False, origin: str | None = None
+    field: RadianceNetwork, path: str | Path, provenance: dict, half: bool = False, origin: str | None = None
 ) -> None:
     """Write ``field``. ``provenance`` (JSON) describes the training data and settings; ``half`` stores the
     weights as fp16; ``origin`` is the checksum of the file that the field was compiled or refined from.
@@ -309,7 +309,7 @@ def save_radiance(
     write_checkpoint(path, "radiance", tensors, metadata)
 
 
-def load_radiance(path: str | Path, ns: ModuleType) -> tuple[RadianceField, dict[str, Any]]:
+def load_radiance(path: str | Path, ns: ModuleType) -> tuple[RadianceNetwork, dict[str, Any]]:
     """Read the field in ``path`` on the backend ``ns`` (see ``fields.mlp.namespace``), and its metadata, to which
     "half" is added: whether the weights are fp16.
 
@@ -338,7 +338,7 @@ def load_radiance(path: str | Path, ns: ModuleType) -> tuple[RadianceField, dict
                 arrays.build_grid(background_config.grid, "background_grid"),
                 arrays.build_network("background_net", background_config.sizes),
             )
-        field = RadianceField(
+        field = RadianceNetwork(
             config,
             box_from_dict(meta["box"]),
             arrays.build_grid(config.grid),
@@ -380,7 +380,7 @@ def matches_checksum(path: str | Path, sha256: object) -> bool:
 _HIT_PARAMETERS = ("weight", "bandwidth", "kappa")  # Numbers of `ReaimedHits` in the metadata
 
 
-def save_gaze(field: AnyGazeField, path: str | Path, provenance: dict, half: bool = False) -> None:
+def save_gaze(field: GazeNetwork, path: str | Path, provenance: dict, half: bool = False) -> None:
     """Write ``field`` with its support and its re-aimed hits, if any.
 
     ``provenance`` (JSON) describes the training data and settings.
@@ -408,13 +408,14 @@ def _read_hits(arrays: StoredArrays, parameters: object) -> ReaimedHits:
     return ReaimedHits(get("origins"), get("points"), **values)
 
 
-def load_gaze(path: str | Path, ns: ModuleType) -> tuple[AnyGazeField, dict[str, Any]]:
+def load_gaze(path: str | Path, ns: ModuleType) -> tuple[GazeNetwork, dict[str, Any]]:
     """Read the gaze field in ``path`` on the backend ``ns``, with its support and its re-aimed hits, and its
-    metadata.
+    metadata with "half" as of `load_radiance`.
 
     Raises `NergError` if the file contains no gaze field.
     """
     tensors, meta = read_checkpoint(path, "gaze")
+    meta["half"] = any(tensor.dtype == np.float16 for tensor in tensors.values())
     with translate_build_errors(path):
         arrays, architecture = StoredArrays(tensors, ns), meta["architecture"]
         check_sizes(architecture, limits=max_sizes_of(architecture))

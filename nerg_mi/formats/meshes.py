@@ -1,7 +1,17 @@
 """Mesh files (PLY, OBJ, binary glTF) as triangles with colours, including files that Mitsuba cannot read.
 
+- Vertex or face colours (PLY ``red, green, blue``; OBJ after the coordinates; glTF ``COLOR_0``) are sRGB if PLY has
+  integers (or floats up to 255) and in OBJ; PLY floats up to 1, as Mitsuba writes them, and glTF colours are linear.
+- Polygons are cut into triangle fans, concave ones from a corner that sees all others.
+- KHR_mesh_quantization is decoded. glTF's y axis becomes z up.
+- Other columns, transparency, textures, materials and animations are named and ignored.
+- Refused: non-finite vertices, indices out of range, decimal commas, unknown statements of an OBJ, rows that differ
+  from the header of a PLY, UTF-16, and glTF extensions that compress or multiply triangles.
+
 Mitsuba's readers support only triangles in PLY, and neither negative indices nor continued lines in OBJ, nor glTF.
 `MeshFile.unreadable_reason` reports this, and `MeshFile` contains the data to pass to Mitsuba instead.
+``nerg scene`` writes such a mesh again as ``NAME.mesh.ply`` next to the scene; a scene file that references it
+directly is refused with the reason.
 """
 
 from __future__ import annotations

@@ -1,4 +1,16 @@
-"""Files of Gaussian splats (3DGS PLY, .splat, SPZ, SOG and glTF), and splats that are derived from a radiance field."""
+"""Files of Gaussian splats (3DGS PLY, .splat, SPZ, SOG and glTF), and splats that are derived from a radiance field.
+
+- ``.ply``: output of 3DGS trainings, columns in any order, binary or text, degrees 0 to 3. Additional columns are
+  kept. Files of 2DGS, without ``scale_2``, become thin. ``filter_3D`` of Mip-Splatting is applied.
+- ``.splat``: 32 bytes per Gaussian (antimatter15); ``.spz``: versions 1 to 3; ``.sog``: version 2 (SuperSplat)
+- ``.glb``: KHR_gaussian_splatting with nodes and colour space; values out of range are refused
+
+Some programs store opacities instead of logits, or lengths instead of their logarithms. From 64 Gaussians on both
+are detected and reported: opacities that are all in 0..1, or in 0..255 and beyond 32 (bytes); scales that are all
+non-negative and similar to the distances between Gaussians. ``.ksplat``, ``.sog`` of version 1, compressed ``.ply``
+and ``.spz`` of version 4 are refused with the command that converts them. Frame and units are those of the file;
+``to_world`` rotates and scales an environment, including colours that depend on the direction.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError, sanitize
-from nerg_mi.fields.radiance import RadianceField
+from nerg_mi.fields.radiance import RadianceNetwork
 from nerg_mi.fields.splats import (
     Splats,
     concatenate_splats,
@@ -25,6 +37,7 @@ from nerg_mi.fields.splats import (
     splats_from_raw_parameters,
 )
 from nerg_mi.files.atomic import check_writable
+from nerg_mi.files.html import Summary
 from nerg_mi.files.safe_read import MAX_JSON_BYTES, map_bytes, open_file, open_gzip, translate_read_errors
 from nerg_mi.files.schema import check_json
 from nerg_mi.maths.coordinates import check_near_origin
@@ -178,7 +191,7 @@ def has_ply_splats(path: str | os.PathLike) -> bool:
     with open_file(path, "PLY file") as file:
         head = file.read(DETECTION_BYTES).replace(b"\r", b"\n")
         names = re.findall(rb"^property [a-z0-9]+ (\w+)\s*$", head, re.MULTILINE)
-        return b"f_dc_0" in names or {b"opacity", b"scale_0", b"rot_0"} <= set(names)
+        return b"f_dc_0" in names or b"packed_position" in names or {b"opacity", b"scale_0", b"rot_0"} <= set(names)
 
 
 def read_ply_splats(path: str | os.PathLike) -> Splats:
@@ -189,6 +202,8 @@ def read_ply_splats(path: str | os.PathLike) -> Splats:
     raw = map_bytes(path, "splat file", MAX_PLY_BYTES, PLY_MAGIC, remedy)
     with translate_read_errors(path, "splat file", remedy):
         tables = parse_ply(np.frombuffer(raw, np.uint8)).tables
+        if "packed_position" in (tables["vertex"].columns if "vertex" in tables else ()):
+            raise ValueError("it is a compressed .ply; convert it by: npx @playcanvas/splat-transform in.ply out.ply")
         first = next(iter(tables), "")
         if first != "vertex":
             raise ValueError(f'its first element is "{first[:40]}", not "vertex"')
@@ -196,8 +211,6 @@ def read_ply_splats(path: str | os.PathLike) -> Splats:
             raise ValueError("its vertices have list properties")
         columns = {name: values() for name, values in tables["vertex"].columns.items()}
         missing = [name for name in (*_CENTER, "opacity", *_SCALE[:2], *_ROTATION, *_BASE) if name not in columns]
-        if "packed_position" in columns:
-            raise ValueError("it is a compressed .ply; convert it by: npx @playcanvas/splat-transform in.ply out.ply")
         if missing:
             raise ValueError(f'it lacks the column "{missing[0]}", which Gaussian splats need')
         rest_columns = sorted((int(m[1]), name) for name in columns if (m := re.fullmatch(r"f_rest_(\d{1,3})", name)))
@@ -441,8 +454,8 @@ _SURFEL_THICKNESS, _OPACITY = 0.1, 0.9
 _NEIGHBORS, _NEAREST = 12, 4
 
 
-@dataclass(frozen=True)
-class SurfaceSplats(Splats):
+@dataclass(frozen=True, repr=False)
+class SurfaceSplats(Summary, Splats):
     """Gaussians on the surface of a radiance field.
 
     Attributes
@@ -462,7 +475,7 @@ class SurfaceSplats(Splats):
         write_ply_splats(path, self, comments=("Gaussian splats of a radiance field, by nerg_mi",))
 
 
-def make_splats(field: RadianceField, resolution: int = 256, threshold: float | None = None) -> SurfaceSplats:
+def make_splats(field: RadianceNetwork, resolution: int = 256, threshold: float | None = None) -> SurfaceSplats:
     """Make Gaussians from the surface of a radiance field, in the frame of the field.
 
     Parameters

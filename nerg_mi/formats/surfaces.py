@@ -12,8 +12,9 @@ import numpy as np
 
 from nerg_mi.errors import NergError, import_extra, parameter
 from nerg_mi.fields.extraction import FieldSampler, Lattice, cell_opacity, find_crossings, surface_density
-from nerg_mi.fields.radiance import RadianceField
+from nerg_mi.fields.radiance import RadianceNetwork
 from nerg_mi.files.atomic import check_writable, write_bytes
+from nerg_mi.files.html import Summary
 from nerg_mi.maths.color import decode_srgb, encode_srgb
 
 from .gltf import Attribute, encode_unlit_glb
@@ -22,8 +23,8 @@ from .ply import write_columns
 # ---- Meshes by marching cubes, and point clouds ----
 
 
-@dataclass
-class Surface:
+@dataclass(repr=False)
+class Surface(Summary):
     """Surface of a radiance field.
 
     Attributes
@@ -62,7 +63,7 @@ class Surface:
 
 
 def extract_mesh(
-    field: RadianceField,
+    field: RadianceNetwork,
     resolution: int = 256,
     threshold: float | None = None,
     fill_cells: int = 1,
@@ -192,7 +193,11 @@ def _count_open_edges(body, lattice: Lattice) -> tuple[int, int]:
 
 
 def extract_points(
-    field: RadianceField, resolution: int = 256, threshold: float | None = None, count: int | None = None, seed: int = 0
+    field: RadianceNetwork,
+    resolution: int = 256,
+    threshold: float | None = None,
+    count: int | None = None,
+    seed: int = 0,
 ) -> Surface:
     """Extract points where lattice edges cross the isosurface, with normals along the negative density gradient.
 
@@ -241,7 +246,7 @@ def extract_points(
     return Surface(p, None, normals, _sample_srgb(field, sampler, p, normals), report)
 
 
-def _sample_srgb(field: RadianceField, sampler: FieldSampler, p, normals) -> np.ndarray:
+def _sample_srgb(field: RadianceNetwork, sampler: FieldSampler, p, normals) -> np.ndarray:
     c = np.clip(sampler.diffuse_color(np.asarray(p), np.asarray(normals)), 0, 1)
     return encode_srgb(c) if field.color_space == "linear" else c
 
@@ -304,7 +309,7 @@ def write_volume(path: str | Path, data: np.ndarray, lower, upper) -> None:
     write_bytes(path, head, np.ascontiguousarray(data).data)
 
 
-def sample_density_and_color(field: RadianceField, resolution: int = 256, color: bool = True, samples: int = 2):
+def sample_density_and_color(field: RadianceNetwork, resolution: int = 256, color: bool = True, samples: int = 2):
     """Sample density and colour on a grid of voxels.
 
     The density gives a voxel the mean opacity of its ``samples``³ points, with an optical depth of at most 5 per voxel,

@@ -1,4 +1,16 @@
-"""Import and export of checkpoints of torch-ngp and of the authors of the NeRG paper: networks, grids and occupancy."""
+"""Import and export of checkpoints of torch-ngp and of the authors of the NeRG paper: networks, grids and occupancy.
+
+- torch-ngp (``ngp_ep*.pth``, ``ngp.pth``, a bare state dictionary): hash grid, both networks, the density bitfield
+  of all cascades (or the density grid, where there is no bitfield), background network, ``aabb_infer``. Not read:
+  ``--tcnn`` and ``--ff`` backbones, align_corners grids, networks with biases. A tiled or smoothstep grid has the
+  shapes of a hashed linear one and cannot be distinguished from it.
+- NeRG (``nerg_ep*.pth``): the gaze field (LayerNorm networks or plain ones) and the NeRF in the same file; variants
+  Emit, Capture, EmitCapture. Not read: Semantic and Attend variants, von Mises-Fisher heads.
+
+Files are read by ``torch.load(weights_only=True)``, after their pickle is checked against a list of permitted
+classes and functions; anything else is refused by name. Files older than torch 1.6, with a pickle protocol other
+than 2, or compressed afterwards are refused.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +23,11 @@ import numpy as np
 
 from nerg_mi.errors import NergError, parameter, sanitize
 from nerg_mi.fields.encoding import HashGrid, HashGridConfig
-from nerg_mi.fields.gaze_product import GazeConfig, GazeField
+from nerg_mi.fields.gaze_product import GazeConfig, ProductHead
 from nerg_mi.fields.mlp import MLP
 from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid, count_cascade_levels
-from nerg_mi.fields.radiance import Background, BackgroundConfig, RadianceConfig, RadianceField
+from nerg_mi.fields.radiance import Background, BackgroundConfig, RadianceConfig, RadianceNetwork
+from nerg_mi.files.html import Summary
 from nerg_mi.maths.geometry import Box
 
 from .fields import check_sizes, translate_build_errors
@@ -276,7 +289,7 @@ DEFAULT_IMPORT_OPTIONS = ImportOptions()  # for checkpoints that were trained wi
 
 def read_torch_ngp(
     path: str | Path, ns: ModuleType, ema: bool | None = None, options: ImportOptions = DEFAULT_IMPORT_OPTIONS
-) -> tuple[RadianceField, dict]:
+) -> tuple[RadianceNetwork, dict]:
     """Read the radiance field in a torch-ngp checkpoint on the backend ``ns``, and its provenance (JSON).
 
     ``ema``: whether to use moving averages; None uses them if the file contains them.
@@ -292,7 +305,7 @@ def read_torch_ngp(
 
 def build_radiance_field(
     state: StateDict, ns: ModuleType, options: ImportOptions, mean_density: float | None = None
-) -> RadianceField:
+) -> RadianceNetwork:
     """Build the field of a torch-ngp state dictionary."""
     for name in state.names():
         if name in ("encoder.params", "sigma_net.params", "color_net.params"):
@@ -313,7 +326,7 @@ def build_radiance_field(
         infer_sh_degree(state, color.inputs - geometry),
     )
     check_sizes(config.to_dict(), "networks")
-    return RadianceField(
+    return RadianceNetwork(
         config,
         box,
         build_grid(state, "encoder", sizes, ns),
@@ -354,7 +367,7 @@ def _build_background(state: StateDict, ns: ModuleType, options: ImportOptions, 
     return Background(config, build_grid(state, "encoder_bg", sizes, ns), net)
 
 
-def make_state_dict(field: RadianceField) -> dict[str, np.ndarray]:
+def make_state_dict(field: RadianceNetwork) -> dict[str, np.ndarray]:
     """Make a state dictionary with which torch-ngp's ``NeRFNetwork(bound)`` renders ``field``.
 
     Raises `NergError` with the reasons if torch-ngp cannot represent the field: the bound determines the sizes of its
@@ -422,8 +435,8 @@ def _store_layers(state: dict, name: str, net: MLP) -> None:
     state |= {f"{name}.{i}.weight": w.numpy() for i, w in enumerate(net.weights)}
 
 
-@dataclass(frozen=True, eq=False)
-class TorchNgpModel:
+@dataclass(frozen=True, eq=False, repr=False)
+class TorchNgpModel(Summary):
     """The networks of a radiance field as a checkpoint of torch-ngp: ``state`` has the arrays by name."""
 
     state: dict[str, np.ndarray]
@@ -436,7 +449,7 @@ class TorchNgpModel:
         write_torch(path, {**head, "mean_density": self.mean_density, "model": self.state})
 
 
-def make_torch_ngp(field: RadianceField) -> TorchNgpModel:
+def make_torch_ngp(field: RadianceNetwork) -> TorchNgpModel:
     """Return ``field`` in the layout of torch-ngp. Raises `NergError` if its grid or networks do not fit."""
     return TorchNgpModel(make_state_dict(field), 0.0 if field.occupancy is None else field.occupancy.coarse.threshold)
 
@@ -457,7 +470,7 @@ def is_nerg_checkpoint(model: dict) -> bool:
 
 def read_nerg(
     path: str | Path, ns: ModuleType, ema: bool | None = None, options: ImportOptions = DEFAULT_IMPORT_OPTIONS
-) -> tuple[RadianceField | None, GazeField, dict]:
+) -> tuple[RadianceNetwork | None, ProductHead, dict]:
     """Read a NeRG checkpoint: radiance field (None if the file has none), gaze field, and provenance (JSON).
 
     The finest resolution of the gaze field is always 256 x bound; ``options`` apply to the NeRF. Raises `NergError` for
@@ -500,7 +513,7 @@ def _read_variant(state: StateDict, stored) -> str:
     return _VARIANTS[name]
 
 
-def build_gaze_field(state: StateDict, variant: str, ns: ModuleType) -> GazeField:
+def build_gaze_field(state: StateDict, variant: str, ns: ModuleType) -> ProductHead:
     """Build the gaze field of a state dictionary of the authors."""
     bound = float(np.abs(shorten_floats(state["aabb_train"])).max())
     normalized = "net1.lin0.weight" in state
@@ -525,7 +538,7 @@ def build_gaze_field(state: StateDict, variant: str, ns: ModuleType) -> GazeFiel
     check_sizes(config.to_dict(), "networks")
     heads = [_build_head(state, names, width, ns) for names in _HEADS.values()]
     box, table = Box((-bound,) * 3, (bound,) * 3, bound), build_grid(state, "encoder", sizes, ns)
-    return GazeField(config, box, table, position, direction, *heads)
+    return ProductHead(config, box, table, position, direction, *heads)
 
 
 def _build_head(state: StateDict, names: tuple, width: int, ns: ModuleType) -> MLP:

@@ -1,1 +1,1 @@
-"""Interfaces between fields and other array frameworks. Each module imports its framework."""
+"""Interfaces to other programs and frameworks: scenes for Rerun and OpenUSD, and fields as modules of PyTorch."""

@@ -71,6 +71,11 @@ def invert_similarity(matrix: Any, name: str) -> np.ndarray:
     return np.linalg.inv(check_rigid_transforms(matrix, name, may_scale=True, shape=(4, 4)))
 
 
+def similarity_scale(matrix: np.ndarray) -> float:
+    """Return the scale of a similarity: units of the target per unit of the source."""
+    return float(np.cbrt(abs(np.linalg.det(matrix[:3, :3]))))
+
+
 def has_last_row(matrices: np.ndarray) -> np.ndarray:
     """Whether the last row of each matrix (N, 4, 4) is 0, 0, 0, 1, (N,) bool; True for (N, 3, 4)."""
     rows = np.abs(matrices[:, 3:] - _LAST_ROW)

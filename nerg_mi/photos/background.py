@@ -32,7 +32,7 @@ _COMPARED_VIEWS = 64
 
 
 @dataclass(frozen=True)
-class Background:
+class DepthBackground:
     """Pixels of depth maps without a surface.
 
     Attributes
@@ -58,7 +58,7 @@ class Background:
         return f"pixels of the depth maps: {', '.join(parts)}"
 
 
-def remove_background(views: Sequence[PhotoView]) -> tuple[list[PhotoView], Background | None]:
+def remove_background(views: Sequence[PhotoView]) -> tuple[list[PhotoView], DepthBackground | None]:
     """Set depths that are no surface to 0, which means unknown.
 
     These are depths far beyond the extent of the cameras and all other depths, such as 1e10, and the far plane of a
@@ -77,7 +77,9 @@ def remove_background(views: Sequence[PhotoView]) -> tuple[list[PhotoView], Back
         return list(views), None
     changed = {k: replace(views[k], depth=depth) for k, depth in zip(index, depths)}
     size = sum(d.size for d in depths)
-    return [changed.get(k, view) for k, view in enumerate(views)], Background(removed / size, unknown / size, nearest)
+    return [changed.get(k, view) for k, view in enumerate(views)], DepthBackground(
+        removed / size, unknown / size, nearest
+    )
 
 
 def _find_background(cameras: list[PosedCamera], depths: list[np.ndarray]) -> dict[int, np.ndarray] | None:
@@ -90,14 +92,14 @@ def _find_background(cameras: list[PosedCamera], depths: list[np.ndarray]) -> di
     return masks if 0 < count <= (1 - _MIN_SURFACE_FRACTION) * total else None
 
 
-def measure_far_plane(cameras: list[PosedCamera], depths: list[np.ndarray]) -> Background | None:
+def measure_far_plane(cameras: list[PosedCamera], depths: list[np.ndarray]) -> DepthBackground | None:
     """Return which fraction of depth maps has a maximum that is no surface, however few pixels show one; None if the
     maximum is a surface."""
     masks, size = _find_far_plane(cameras, depths), sum(d.size for d in depths)
     if not masks:
         return None
     removed, finite = (sum(map(np.count_nonzero, arrays)) for arrays in (masks.values(), depths))
-    return Background(removed / size, 1 - finite / size, min(float(depths[k][m].min()) for k, m in masks.items()))
+    return DepthBackground(removed / size, 1 - finite / size, min(float(depths[k][m].min()) for k, m in masks.items()))
 
 
 def _find_far_plane(cameras: list[PosedCamera], depths: list[np.ndarray]) -> dict[int, np.ndarray]:

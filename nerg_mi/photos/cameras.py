@@ -1,5 +1,10 @@
 """Camera models: OpenCV lenses and their inverses, intrinsics, rays of posed cameras, and resizing of images.
 
+Lenses are OpenCV's pinhole model with k1 to k6, p1, p2 (COLMAP: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL,
+OPENCV, FULL_OPENCV) and OpenCV's fisheye model with k1 to k4 (OPENCV_FISHEYE, SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE,
+SIMPLE_FISHEYE, FISHEYE). Others (FOV, division, EUCM, thin prism, equirectangular, f-theta) are refused: undistort
+such photos first. Rays leave each pixel through its lens; photos are not resampled.
+
 Frames: image x right, y down, pixel centres at half-integers.
 """
 

@@ -19,6 +19,7 @@ from nerg_mi.errors import MissingFile, NergError, format_error, sanitize
 from nerg_mi.files.atomic import file_sha256
 from nerg_mi.files.safe_read import (
     check_regular_file,
+    find_other_content,
     is_regular_file,
     measure_byte_order_mark,
     open_file,
@@ -27,7 +28,7 @@ from nerg_mi.files.safe_read import (
 from nerg_mi.maths.transforms import ROTATION_TOLERANCE
 
 from .observed import MatchedImage, PointTable
-from .posed import MAX_POSITION, FileFinder, MaskFile, PosedFrame, PosedImages, UnusedFrame, format_names, sort_frames
+from .posed import MAX_POSITION, FileFinder, MaskFile, Photos, PosedFrame, UnusedFrame, format_names, sort_frames
 from .transforms import read_frame_poses
 
 # ---- COLMAP sparse models: ``cameras``, ``images`` and ``points3D``, as ``.bin`` or ``.txt`` ----
@@ -170,7 +171,7 @@ def read_colmap(
     masks: str | Path | None = None,
     allow_outside: bool = False,
     root: Path | None = None,
-) -> PosedImages:
+) -> Photos:
     """Read the COLMAP model in ``folder``, in its own world coordinates.
 
     Parameters
@@ -188,7 +189,7 @@ def read_colmap(
 
     Returns
     -------
-    PosedImages
+    Photos
         The frames. Frames that cannot be used are listed. A note reports a text file whose stated number of records
         differs from the actual one.
 
@@ -226,9 +227,7 @@ def read_colmap(
     notes = [] if binary else [n for k, c in counts.items() for n in _check_stated_count(files[k], c)]
     digest = _compute_digest(files)
     folders = frozenset([images, *(p for p in images.rglob("*") if p.is_dir())])
-    return PosedImages(
-        files["images"], frames, unused, None, digest, notes, points, root, folders, frozenset(listed_images)
-    )
+    return Photos(files["images"], frames, unused, None, digest, notes, points, root, folders, frozenset(listed_images))
 
 
 def count_images(folder: Path) -> int:
@@ -254,7 +253,7 @@ def read_image_poses(folder: str | Path) -> tuple[Path, str, list[tuple[str, np.
     path
         The file of images.
     sha256
-        Digest of the model, as in `PosedImages`.
+        Digest of the model, as in `Photos`.
     poses
         Name and OpenGL camera-to-world pose (4, 4) of each image.
     notes
@@ -519,6 +518,13 @@ def _check_stated_count(path: Path, count: int) -> list[str]:
     ]
 
 
+def _bad_line(path: Path, number: int, words: list[str], expected: str) -> NergError:
+    line = sanitize(" ".join(words), 80)
+    return NergError(
+        f'line {number} of "{path}" is "{line}" instead of "{expected}", with decimal points; export the model again'
+    )
+
+
 def _read_cameras_txt(path: Path) -> dict[int, _Camera]:
     out = {}
     for number, words in _iter_rows(path, MAX_IMAGES, "cameras"):
@@ -526,7 +532,7 @@ def _read_cameras_txt(path: Path) -> dict[int, _Camera]:
             index = int(words[0])
             camera = _Camera(words[1], int(words[2]), int(words[3]), tuple(map(float, words[4:])))
         except (ValueError, IndexError) as e:
-            raise NergError(f'line {number} of "{path}" is not "CAMERA_ID MODEL WIDTH HEIGHT PARAMETERS"') from e
+            raise _bad_line(path, number, words, "CAMERA_ID MODEL WIDTH HEIGHT PARAMETERS") from e
         _add_camera(out, index, camera, path)
     return out
 
@@ -549,7 +555,7 @@ def _read_images_txt(path: Path, with_points: bool = False) -> list[_ImageRecord
             padded_name = re.split(r"\s+", line.lstrip(), maxsplit=8)[8][len(words[8]) + 1 :]
             out.append(_ImageRecord(padded_name.strip(), int(words[8]), q, t, padded_name=padded_name))
         except (ValueError, IndexError) as e:
-            raise NergError(f'line {number} of "{path}" is not "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"') from e
+            raise _bad_line(path, number, words, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME") from e
         _check_count(path, len(out), MAX_IMAGES, "images")
         follows_image = True
     return out
@@ -611,6 +617,9 @@ class NamedPoses:
     notes: list[str]  # notes on contradictions within a COLMAP model, and on models that are not used
 
 
+_ESTIMATE = ', estimate the poses of photos or a video with "nerg poses" (find_poses)'
+
+
 def find_pose_source(dataset: str | Path) -> Path:
     """Return the transforms file of ``dataset``, or the folder of its COLMAP model; of several models, the one with
     most images.
@@ -618,8 +627,13 @@ def find_pose_source(dataset: str | Path) -> Path:
     ``dataset``: a folder, or the file itself.
     """
     dataset = Path(dataset)
-    if dataset.exists() and not dataset.is_dir():
+    if not dataset.exists():
+        raise MissingFile(f'there is no posed image set "{dataset}"; correct its name')
+    if not dataset.is_dir():
         check_regular_file(dataset, "posed image set")
+        if dataset.suffix.lower() not in (".bin", ".txt", ".json"):
+            reason = find_other_content(dataset) or "is no posed image set"
+            raise NergError(f'"{dataset}" {reason}; specify a folder, a transforms file or a COLMAP model{_ESTIMATE}')
         # A file of a COLMAP model selects the model.
         return dataset.parent if dataset.suffix in (".bin", ".txt") else dataset
     for name in ("transforms.json", "transforms_train.json"):
@@ -631,7 +645,8 @@ def find_pose_source(dataset: str | Path) -> Path:
             return models[0] if len(models) == 1 else max(models, key=count_images)
     raise MissingFile(
         f'"{dataset}" contains neither transforms.json nor transforms_train.json nor a COLMAP model '
-        "(sparse/0/cameras.bin); specify the folder of a posed image set"
+        f"(sparse/0/cameras.bin); specify the folder of a posed image set{_ESTIMATE}, or convert an export of "
+        'Polycam, Record3D, Metashape or RealityCapture with "ns-process-data" of nerfstudio'
     )
 
 

@@ -1,14 +1,33 @@
-"""Preparation of a posed image set for training: training views, held-out views and the bounding box of the scene."""
+"""Preparation of a posed image set for training: training views, held-out views and the bounding box of the scene.
+
+Coordinates: a field keeps those of the file; nothing is centred, rotated or scaled without an option. The up
+direction is estimated from how cameras are held and, with points, from a floor or table. ``--coordinates upright``
+rotates the environment about its origin to +z up; ``original`` undoes nerfstudio's ``applied_transform`` and
+``applied_scale``; the path of a ``dataparser_transforms.json`` uses the coordinates that nerfstudio trained in.
+``--scale`` then multiplies all lengths. ``to_file`` in the checkpoint's provenance leads back.
+
+Box: the first of ``--aabb``; ``aabb`` of the file; COLMAP's points or, if every frame has depth, its points, without
+outliers and extended to the cameras; the cameras. Cameras that look at a common point bound the box around it; other
+cameras are inside. A guess from cameras alone in a room in which they hardly move is too small: set ``--aabb``.
+
+Unbounded environments: if more than 2 % of the points lie beyond that box, or a box two fifths as large would hold
+nine tenths of them, the environment is unbounded. Its core, a box that holds nine tenths of the points, is resolved
+as a box would be. Around it, out to 64 times its edge, positions are contracted before encoding (mip-NeRF 360,
+equation 10, by the largest coordinate). Rays stay straight, and depths, positions, visibility and gaze are in scene
+units. Steps are at least 1/128 of their distance from the ray's start (``dt_gamma``). Images with alpha, a declared
+box, and sets without points are bounded. ``--unbounded`` and ``--bounded`` override this. Exported volumes, points
+and meshes cover the box only.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from nerg_mi.errors import NergError, parameter
 from nerg_mi.files.safe_read import resolve_path
+from nerg_mi.files.values import FilePath
 from nerg_mi.maths.geometry import AnyBox, Box, ContractedBox, intersect_box_numpy
 from nerg_mi.ranges import MAX_COORDINATE
 
@@ -17,7 +36,7 @@ from .background import measure_far_plane, remove_background
 from .cameras import PosedCamera, pixel_directions, project
 from .colmap import UpEstimate
 from .images import PhotoView, estimate_photo_up, load_usable_views, read_split
-from .posed import PosedImages, UnusedFrame
+from .posed import Photos, UnusedFrame
 
 # ---- Bounding box of a scene ----
 #
@@ -247,13 +266,15 @@ def _half_angle_tangent(camera: PosedCamera) -> float:
 def find_unmatched(cameras: list[PosedCamera], box: AnyBox, grid: int = 4, depths: int = 12) -> list[int]:
     """Return the indices of cameras whose images share no point within ``box`` with any other image.
 
-    ``grid`` by ``grid`` pixels of each image are sampled at ``depths`` distances within the box.
+    ``grid`` by ``grid`` pixels of each image are sampled at ``depths`` distances within the box; more pixels if none
+    of these shows the box, since an object may be small.
     """
     centers = np.array([c.center for c in cameras])
     order = np.arange(len(cameras))
     unmatched = []
     for k, camera in enumerate(cameras):
-        p = _sample_rays(camera, box, grid, depths)
+        samples = (_sample_rays(camera, box, size, depths) for size in (grid, 4 * grid, 16 * grid))
+        p = next((points for points in samples if len(points)), np.empty((0, 3)))
         # Nearest cameras first: the search ends at the first camera that sees a point.
         neighbors = order[np.argsort(np.linalg.norm(centers - centers[k], axis=1), kind="stable")]
         if not any(_sees_any(cameras[j], p) for j in neighbors if j != k):
@@ -295,13 +316,21 @@ def explain_wrong_depth(views: list[tuple[PosedCamera, np.ndarray]]) -> str | No
     """
     selected = [views[k] for k in np.unique(np.linspace(0, len(views) - 1, _COMPARED_VIEWS).astype(int))]
     compared = [(c, d, depth_points(c, d, _COMPARED_POINTS) - c.center) for c, d in selected]
-    agreement = _compute_agreement(compared, 1.0)
-    if agreement <= 1 - _MIN_AGREEMENT_GAIN:
-        best, factor = max((_compute_agreement(compared, f, _MIN_COMPARISONS), f) for f in _UNIT_FACTORS)
-        if best >= _MIN_AGREEMENT_GAIN + max(agreement, _compute_agreement(compared, 10 * factor)):
+    agreeing, count = _count_agreeing(compared, 1.0)
+    agreement, best = agreeing / max(count, 1), (0.0, 0.0, 0)
+    for factor in _UNIT_FACTORS if agreement <= 1 - _MIN_AGREEMENT_GAIN else ():
+        scaled_agreeing, scaled_count = _count_agreeing(compared, factor)
+        # In a larger unit fewer points are before other cameras, and these may agree by chance.
+        if scaled_count >= _MIN_COMPARISONS and scaled_agreeing > agreeing:
+            best = max(best, (scaled_agreeing / scaled_count, factor, scaled_count))
+    fraction, factor, scaled_count = best
+    if fraction >= _MIN_AGREEMENT_GAIN + agreement:
+        larger_agreeing, larger_count = _count_agreeing(compared, 10 * factor)
+        larger = larger_agreeing / larger_count if 2 * larger_count >= scaled_count else 0.0
+        if fraction >= _MIN_AGREEMENT_GAIN + larger:
             return (
-                f"{best:.0%} of its points agree with the depth of other views after multiplication by {factor:g}, but "
-                f"{agreement:.0%} without it"
+                f"{fraction:.0%} of its points agree with the depth of other views after multiplication by "
+                f"{factor:g}, but {agreement:.0%} without it"
             )
     extent = float(np.linalg.norm(np.ptp([c.center for c, _ in views], axis=0)))
     median = float(np.median([np.median(d[d > 0]) for _, d in views if (d > 0).any()] or [0.0]))
@@ -310,11 +339,9 @@ def explain_wrong_depth(views: list[tuple[PosedCamera, np.ndarray]]) -> str | No
     return None
 
 
-def _compute_agreement(
-    views: list[tuple[PosedCamera, np.ndarray, np.ndarray]], factor: float, min_count: int = 1
-) -> float:
-    """Return the fraction of depth points, scaled by ``factor``, that agree with the depth of other views that see
-    them; 0 if these are fewer than ``min_count`` points.
+def _count_agreeing(views: list[tuple[PosedCamera, np.ndarray, np.ndarray]], factor: float) -> tuple[int, int]:
+    """Return how many depth points, scaled by ``factor``, agree with the depth of other views that see them, and how
+    many these see.
 
     Each view: camera, depth (h, w), and points (N, 3) from its depth relative to its centre.
     """
@@ -328,7 +355,7 @@ def _compute_agreement(
         measured, expected = factor * depth[y, x], np.linalg.norm(other_points[is_visible] - camera.center, axis=1)
         count += int((measured > 0).sum())
         agreeing += int(np.sum((measured > 0) & (np.abs(measured - expected) <= _DEPTH_TOLERANCE * expected)))
-    return agreeing / count if count >= min_count else 0.0
+    return agreeing, count
 
 
 def depth_points(camera: PosedCamera, depth: np.ndarray, max_points: int) -> np.ndarray:
@@ -384,10 +411,9 @@ class Dataset:
 
 
 def open_dataset(
-    path: str | Path,
+    photos: Photos | FilePath,
     holdout: int | None = None,
     width: int | None = None,
-    downscale: float | None = None,
     aabb: tuple | None = None,
     depth: bool = True,
     scale: float = 1.0,
@@ -399,12 +425,12 @@ def open_dataset(
 
     Parameters
     ----------
-    path
-        Folder with a transforms file or a COLMAP model, or one of these.
+    photos
+        Posed photos, or their file as in `load_photos`.
     holdout, coordinates, scale, allow_outside
         As in `read_split`.
-    width, downscale
-        Image size: width in pixels, or a divisor.
+    width
+        Width of the images in pixels. Default: their own.
     aabb
         Bounding box x0, y0, z0, x1, y1, z1 in the requested coordinates. Default: "aabb" of the file, or an estimate
         from surface points (of COLMAP, or from depth) or from the cameras.
@@ -424,14 +450,14 @@ def open_dataset(
     NergError
         With file and frame, if no frame can be used.
     """
-    split = read_split(path, holdout, coordinates, scale, allow_outside)
-    train, unusable = load_usable_views(split.posed.frames, width, downscale, depth)
+    split = read_split(photos, holdout, coordinates, scale, allow_outside)
+    train, unusable = load_usable_views(split.posed.frames, width, depth)
     if not train:
         raise NergError(
             f'none of the {len(unusable)} training frames of "{split.posed.path}" can be used; the first, '
             f'"{unusable[0].name}": {unusable[0].reason}'
         )
-    held_out, unusable_held_out = load_usable_views(split.held_out, width, downscale, depth)
+    held_out, unusable_held_out = load_usable_views(split.held_out, width, depth)
     views, background = remove_background([*train, *held_out])
     train, held_out = views[: len(train)], views[len(train) :]
     _check_depth(split.posed, train)
@@ -479,7 +505,7 @@ def open_dataset(
     )
 
 
-def _check_depth(posed: PosedImages, views: list[PhotoView]) -> None:
+def _check_depth(posed: Photos, views: list[PhotoView]) -> None:
     """Raise `NergError` if the unit of the depth differs from that of the cameras, or hardly any is a surface."""
     views_with_depth = [(v.camera, v.depth) for v in views if v.depth is not None]
     reason = explain_wrong_depth(views_with_depth) if views_with_depth else None
@@ -508,7 +534,7 @@ def _describe_masks(views: list[PhotoView]) -> list[str]:
     return [f"masks exclude {np.mean(fractions):.1%} of the pixels of {len(fractions)} frames"]
 
 
-def _choose_extent(posed: PosedImages, views: list[PhotoView], aabb, unbounded: bool | None) -> SceneExtent:
+def _choose_extent(posed: Photos, views: list[PhotoView], aabb, unbounded: bool | None) -> SceneExtent:
     """Return the specified or estimated box, contracted as requested or estimated."""
     extent = _find_extent(posed, views, aabb)
     if unbounded is None or unbounded == extent.box.is_contracted:
@@ -519,7 +545,7 @@ def _choose_extent(posed: PosedImages, views: list[PhotoView], aabb, unbounded: 
     return SceneExtent(core, extent.source, "room", "it ends at its box, as requested")
 
 
-def _find_extent(posed: PosedImages, views: list[PhotoView], aabb) -> SceneExtent:
+def _find_extent(posed: Photos, views: list[PhotoView], aabb) -> SceneExtent:
     if aabb is not None:
         if len(aabb) != 6:
             raise NergError(f"aabb needs the six numbers x0,y0,z0,x1,y1,z1, got {len(aabb)}")
@@ -570,7 +596,7 @@ def _describe_up(up: UpEstimate) -> str:
     )
 
 
-def _describe_unit(posed: PosedImages, views: list[PhotoView], box: AnyBox, scale: float) -> str:
+def _describe_unit(posed: Photos, views: list[PhotoView], box: AnyBox, scale: float) -> str:
     """Describe the length of a unit."""
     centers = np.array([v.camera.center for v in views])
     size = " x ".join(f"{u - l:.3g}" for l, u in zip(box.lower, box.upper))

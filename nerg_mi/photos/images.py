@@ -1,5 +1,31 @@
-"""Images, depth and masks of posed sets: reading, undistortion, resizing, and the split into training and
-held-out views.
+"""Images, depth and masks of posed sets: reading, undistortion, resizing, and the split into training and held-out
+views.
+
+Images: JPEG and PNG of 8 or 16 bits are sRGB with straight alpha. EXR is linear with premultiplied alpha and is
+converted; values above white are clipped. Images with alpha show an object in front of nothing.
+
+Orientation: COLMAP, nerfstudio and instant-ngp ignore the EXIF orientation, other programs rotate first. The
+camera's width and height decide. Where both fit, photos of a COLMAP model are taken as stored; others are left out
+until the tag is removed (``exiftool -Orientation= FILE``).
+
+Masks: ``mask_path`` (black is left out), instant-ngp's ``dynamic_mask_NAME.png`` (white is left out), or
+``masks/NAME.png`` next to COLMAP's ``images/`` (black is left out). White begins above half (in a file of zeros and
+ones, at one). In a mask of one colour, alpha is the mask.
+
+Depth maps: ``depth_file_path`` or ``depth_path``, distances along the viewing axis (z), or along rays with
+``"is_euclidean_depth": true``. 0 and non-finite values are unknown, and so is the background: values far beyond all
+others, a maximum that is repeated as only a far plane can be, and the largest number of 16 bits. A map may have
+fewer pixels than its photo, in the same shape.
+
+- PNG of 16 bits and NPY: one step is 0.001 m of the original coordinates, else ``depth_unit_scale_factor`` in
+  metres, or instant-ngp's ``integer_depth_scale`` in units of the file. NPY in metres needs
+  ``"depth_unit_scale_factor": 1.0``.
+- EXR: metres, as Record3D writes them, else the same keys; the channel called Z or depth, the only one, or grey.
+- Depth whose unit differs from that of the cameras is refused: its median exceeds 100 times the cameras' extent, or
+  another usual factor makes a fifth more of its points agree with other views to 5 %. ``--no-depth`` ignores depth.
+
+Sensors of Mitsuba have no distortion: `undistort_photo` returns a photo as a pinhole camera would have taken it, a
+mask, and the sensor; `make_pinhole_camera` and `apply_lens` distort a rendering instead.
 """
 
 from __future__ import annotations
@@ -15,6 +41,7 @@ import numpy as np
 from nerg_mi.errors import MissingFile, NergError, format_error, sanitize
 from nerg_mi.files.images import check_image, read_exr
 from nerg_mi.files.safe_read import is_regular_file, read_npy, resolve_path, translate_read_errors
+from nerg_mi.files.values import FilePath, to_path
 from nerg_mi.maths.color import encode_srgb
 from nerg_mi.ranges import LENGTHS, check_number
 
@@ -40,7 +67,7 @@ from .colmap import (
     rotation_to_z,
 )
 from .observed import ObservedPoints
-from .posed import DepthFile, MaskFile, PosedFrame, PosedImages, UnusedFrame, format_names
+from .posed import DepthFile, MaskFile, Photos, PosedFrame, UnusedFrame, format_names
 from .transforms import read_dataparser, read_transforms
 
 # ---- Images, depth and masks from files ----
@@ -214,6 +241,11 @@ def read_depth(source: DepthFile) -> np.ndarray:
         raise NergError(f'the depth file "{path}" must contain one number per pixel, got shape {out.shape}')
     if np.iscomplexobj(out):
         raise NergError(f'the depth file "{path}" contains complex numbers; save it as float32')
+    if not np.any(out > 0) and len(np.unique(out[out < 0])) > 1:
+        raise NergError(
+            f'all values of the depth file "{path}" are negative; distances are positive: negate them, or remove '
+            "depth_file_path"
+        )
     largest = np.iinfo(out.dtype).max if np.issubdtype(out.dtype, np.integer) else _MAX_HALF
     with np.errstate(over="ignore", invalid="ignore"):  # values beyond float32 are unknown depth
         scaled = out.astype(np.float32) * np.float32(source.unit)
@@ -340,43 +372,37 @@ def split_holdout(frames: list[PosedFrame], every: int) -> tuple[list[PosedFrame
 
 
 def load_usable_views(
-    frames: list[PosedFrame], width: int | None = None, downscale: float | None = None, depth: bool = False
+    frames: list[PosedFrame], width: int | None = None, depth: bool = False
 ) -> tuple[list[PhotoView], list[UnusedFrame]]:
     """Load all ``frames`` with `load_view`. Returns the views, and the frames that cannot be used."""
-    check_size(width, downscale)
+    check_width(width)
     views, unused = [], []
     for frame in frames:
         try:
-            views.append(load_view(frame, width, downscale, depth))
+            views.append(load_view(frame, width, depth))
         except ValueError as e:
             unused.append(UnusedFrame(frame.name, format_error(e)))
     return views, unused
 
 
-def check_size(width: int | None, downscale: float | None) -> None:
-    """Raise `NergError` for an invalid image size."""
-    if width is not None and downscale is not None:
-        raise NergError("specify either width or downscale, not both")
+def check_width(width: int | None) -> None:
+    """Raise `NergError` for an invalid width of images."""
     if width is not None and width < 1:
         raise NergError(f"width must be at least 1 pixel, got {width}")
-    if downscale is not None and not downscale >= 1:
-        raise NergError(f"downscale must be at least 1, got {downscale}")
 
 
-def load_view(
-    frame: PosedFrame, width: int | None = None, downscale: float | None = None, depth: bool = False
-) -> PhotoView:
-    """Load ``frame`` at its full size, at a width of ``width`` pixels, or divided by ``downscale``.
+def load_view(frame: PosedFrame, width: int | None = None, depth: bool = False) -> PhotoView:
+    """Load ``frame`` at its full size, or at a width of ``width`` pixels.
 
     Images are resized by area averaging of the stored (sRGB) values, as other trainers do. Depth is resized to the
     nearest value. A pixel is used if all pixels that it covers are set in the mask. ``depth``: whether to read depth
     files. Raises `NergError` with the name of the file that cannot be used.
     """
-    check_size(width, downscale)
+    check_width(width)
     pixels = read_photo(frame)
     h, w = pixels.shape[:2]
     stated = frame.intrinsics(w, h)
-    factor = w / width if width is not None else downscale or 1.0
+    factor = w / width if width is not None else 1.0
     if factor < 1:
         raise NergError(f'the image "{frame.image}" is only {w} pixels wide; choose a width of at most {w}')
     size = max(1, round(w / factor)), max(1, round(h / factor))
@@ -447,17 +473,40 @@ class HoldoutSplit:
         How the frames were held out, for provenance.
     """
 
-    posed: PosedImages
+    posed: Photos
     held_out: list[PosedFrame]
     rule: str
 
 
-def read_posed_images(source: Path, allow_outside: bool = False) -> PosedImages:
-    """Read the source that `find_pose_source` found.
+def load_photos(path: FilePath, allow_outside: bool = False) -> Photos:
+    """Load posed photos: the poses and lenses of their cameras, and where their files are. Images are not read.
 
-    ``allow_outside``: whether files outside of its folder may be used. For a COLMAP model, this is the folder that
-    contains its images.
+    Parameters
+    ----------
+    path : path
+        Their folder, its transforms.json, or a COLMAP model.
+    allow_outside : bool
+        Whether files outside of the folder may be used. For a COLMAP model, this is the folder that contains its
+        images.
+
+    Returns
+    -------
+    Photos
+        The photos, for `train_radiance`, `evaluate_radiance` and `align`.
+
+    Raises
+    ------
+    NergError
+        The file does not exist or is damaged, or none of its frames can be used.
+
+    Examples
+    --------
+    >>> import nerg_mi as nerg
+    >>> loaded = nerg.load_photos(photos)  # photos: a folder of posed photos
+    >>> len(loaded) == len(loaded.centers)
+    True
     """
+    source = find_pose_source(to_path(path))
     if source.is_file():
         return read_transforms(source, allow_outside)
     folders = [source, *list(resolve_path(source).parents)[:3]]
@@ -477,8 +526,13 @@ def read_posed_images(source: Path, allow_outside: bool = False) -> PosedImages:
     return replace(posed, notes=[*posed.notes, *notes])
 
 
+def open_photos(photos: Photos | FilePath, allow_outside: bool = False) -> Photos:
+    """Return photos unchanged, or load them from their file, as `load_photos` does."""
+    return photos if isinstance(photos, Photos) else load_photos(photos, allow_outside)
+
+
 def read_split(
-    dataset: str | Path,
+    dataset: Photos | FilePath,
     holdout: int | None = None,
     coordinates: str = "file",
     scale: float = 1.0,
@@ -489,7 +543,7 @@ def read_split(
     Parameters
     ----------
     dataset
-        The data set, as in `find_pose_source`.
+        The data set, as in `open_photos`.
     holdout
         Hold out every n-th frame; 0: none. None: the frames of ``transforms_test.json`` or ``transforms_val.json`` next
         to the file, or the test frames that the file lists, or every 8th frame.
@@ -500,11 +554,9 @@ def read_split(
     scale
         Scale factor for all lengths, applied last.
     allow_outside
-        As in `read_posed_images`.
+        As in `load_photos`.
     """
-    source = find_pose_source(dataset)
-    posed = read_posed_images(source, allow_outside)
-    original = posed
+    original = posed = open_photos(dataset, allow_outside)
     similarity = _choose_similarity(posed, coordinates, scale)
     posed = posed.transform(similarity)
     if posed.unassigned:
@@ -517,7 +569,7 @@ def read_split(
                 f"{len(spare)} frames are in neither the training nor the test list of {posed.path.name}",
             ],
         )
-    test_path = _find_test_file(source) if holdout is None else None
+    test_path = _find_test_file(original.path) if holdout is None else None
     test = None if test_path is None else read_transforms(test_path, allow_outside)
     posed = replace(posed, notes=[*posed.notes, *_describe_unused_files([original, *([] if test is None else [test])])])
     if test is not None and test_path is not None:
@@ -549,13 +601,13 @@ def read_split(
     return HoldoutSplit(replace(posed, frames=train), held_out, f"every {every}th frame" if every else "none")
 
 
-def estimate_photo_up(posed: PosedImages) -> UpEstimate:
+def estimate_photo_up(posed: Photos) -> UpEstimate:
     """Estimate the up direction from the cameras and points of ``posed``."""
     points = np.zeros((0, 3)) if posed.points is None else posed.points
     return estimate_up(np.stack([f.to_world for f in posed.frames]), points)
 
 
-def _describe_unused_files(sets: list[PosedImages]) -> list[str]:
+def _describe_unused_files(sets: list[Photos]) -> list[str]:
     """Describe photos and other files in the folder of a data set that the files of ``sets`` do not use."""
     resolve = cache(resolve_path)
     locate = lambda path: resolve(path.parent) / path.name
@@ -587,8 +639,8 @@ def _describe_unused_files(sets: list[PosedImages]) -> list[str]:
 
 
 def _find_test_file(source: Path) -> Path | None:
-    if not source.is_file():
-        return None
+    if source.suffix.lower() != ".json":
+        return None  # a COLMAP model
     for name in ("transforms_test.json", "transforms_val.json"):
         path = source.with_name(name)
         if path != source and is_regular_file(path, "transforms file"):
@@ -596,7 +648,7 @@ def _find_test_file(source: Path) -> Path | None:
     return None
 
 
-def _choose_similarity(posed: PosedImages, coordinates: str, scale: float) -> np.ndarray:
+def _choose_similarity(posed: Photos, coordinates: str, scale: float) -> np.ndarray:
     """Return the transform from the coordinates of the file to the requested ones."""
     check_number(scale, LENGTHS, "scale")
     original = np.eye(4) if posed.to_original is None else posed.to_original

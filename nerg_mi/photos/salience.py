@@ -4,9 +4,11 @@ photos.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,9 +18,8 @@ from nerg_mi.maths.transforms import invert_similarity
 
 from . import cameras
 from .cameras import Intrinsics, PosedCamera, make_area_weights, resize_by_area, resize_mask, resize_nearest
-from .colmap import find_pose_source
-from .images import open_bitmap, read_mask, read_photo, read_posed_images
-from .posed import MaskFile, PosedFrame, check_inside, describe_unused
+from .images import open_bitmap, open_photos, read_mask, read_photo
+from .posed import MaskFile, Photos, PosedFrame, check_inside, describe_unused
 
 # ---- Solid angles of pixels for any lens ----
 #
@@ -232,11 +233,11 @@ class SalienceSet:
 
 
 def open_salience(
-    dataset: str | Path,
+    dataset: Photos | str | Path,
     source: str | Path,
     per: str = "pixel",
     align: np.ndarray | None = None,
-    field_provenance: dict | None = None,
+    field_provenance: Mapping[str, Any] | None = None,
     allow_outside: bool = False,
 ) -> SalienceSet:
     """Read the saliency maps of a posed image set.
@@ -244,7 +245,7 @@ def open_salience(
     Parameters
     ----------
     dataset
-        The posed image set, as in `colmap.find_pose_source`.
+        The posed photos, or their file as in `load_photos`.
     source
         Folder with one .png, .exr or .npy per frame, with the name of the photo except for the suffix; or the name of a
         model (``SALIENCE_MODELS``), which computes the maps from the photos.
@@ -270,7 +271,7 @@ def open_salience(
     """
     if per not in VALUE_UNITS:
         raise NergError(f'per must be {" or ".join(VALUE_UNITS)}, got "{per}"')
-    posed = read_posed_images(find_pose_source(dataset), allow_outside)
+    posed = open_photos(dataset, allow_outside)
     if (
         align is None
         and field_provenance

@@ -1,16 +1,22 @@
 """Posed image sets in ``transforms.json`` files of instant-ngp, nerfstudio and the Blender NeRF scenes.
 
-Differences between the formats:
+Keys of a file or frame:
 
-- Poses: instant-ngp's ``from_mitsuba`` (or ``normal_mts_args``) means that cameras look along +z with x to the left.
-- Depth: nerfstudio's ``depth_file_path`` and instant-ngp's ``depth_path``, along the viewing axis. NPY and 16-bit PNG
-  are in millimetres, as in nerfstudio (get_depth_image_from_path), and EXR in metres, as Record3D writes it, of the
-  original coordinates. ``depth_unit_scale_factor`` is the length of a step in metres, ``integer_depth_scale`` in units
-  of the file. ``is_euclidean_depth``: true for distances along the ray of each pixel.
-- Masks: ``mask_path``, black is excluded; instant-ngp's ``dynamic_mask_NAME.png`` next to the image, white is excluded.
-- ``applied_transform``, ``applied_scale``: transform that the writer applied to the original coordinates;
-  `PosedImages.to_original` inverts it. ``dataparser_transforms.json``: transform from the original coordinates to those
-  in which nerfstudio trained.
+- Read: ``frames``, ``file_path``, ``transform_matrix``, ``w``, ``h``, ``fl_x``, ``fl_y``, ``cx``, ``cy``,
+  ``camera_angle_x``, ``camera_angle_y``, ``x_fov``, ``y_fov``, ``k1`` to ``k6``, ``p1``, ``p2``,
+  ``distortion_params``, ``camera_model``, ``is_fisheye``, ``mask_path``, keys of depth, ``enable_depth_loading``,
+  ``aabb``, ``train_filenames``, ``val_filenames``, ``test_filenames``; ``applied_transform`` and ``applied_scale``,
+  the transform that the writer applied to the original coordinates (`Photos.to_original` inverts it);
+  ``from_mitsuba`` or instant-ngp's ``normal_mts_args``: cameras look along +z with x to the left.
+- Ignored: ``aabb_scale``, ``scale``, ``offset``, ``render_aabb``, ``up``, ``sharpness``, ``orientation_override``,
+  ``colmap_im_id``, ``rotation``, ``timestamp`` and similar.
+- Refused unless off: ``rolling_shutter``, ``transform_matrix_start``, ``transform_matrix_end``,
+  ``white_transparent``, ``black_transparent``, ``fix_premult``, ``latlong``, ``equirectangular``,
+  ``fisheye_crop_radius``, ``skew`` and other coefficients of lenses; unknown keys that name a convention, a
+  coordinate system, a kind of lens, the encoding of colours, inverted masks, or the unit or kind of depth.
+- Others are named once.
+
+``dataparser_transforms.json`` is the transform from the original coordinates to those in which nerfstudio trained.
 """
 
 from __future__ import annotations
@@ -33,8 +39,8 @@ from .posed import (
     DepthFile,
     FileFinder,
     MaskFile,
+    Photos,
     PosedFrame,
-    PosedImages,
     UnusedFrame,
     check_inside,
     format_names,
@@ -93,7 +99,7 @@ _HARMLESS_VALUES = {"opengl", "nerfstudio", "nerf", "blender", "c2w", "camera_to
 _HARMLESS_VALUES |= {"perspective", "pinhole", "srgb"}
 
 
-def read_transforms(path: str | Path, allow_outside: bool = False) -> PosedImages:
+def read_transforms(path: str | Path, allow_outside: bool = False) -> Photos:
     """Read a transforms file. Frames that cannot be used are listed.
 
     ``allow_outside``: whether images, masks and depth files outside of the folder of the file may be used, after links
@@ -134,7 +140,7 @@ def read_transforms(path: str | Path, allow_outside: bool = False) -> PosedImage
         notes.append(f'{len(moved)} photos are not where {path.name} states, but in "{folder}", and used from there')
     if unused_keys:
         notes.append(f"unused keys of {path.name}: {format_names(sorted(unused_keys), 12)}")
-    return PosedImages(
+    return Photos(
         path,
         frames,
         unused,

@@ -13,23 +13,17 @@ from typing import Any
 
 import numpy as np
 
+from nerg_mi.aoi.placed import Aoi, HitAssignment, assign_hits, merge_members
+from nerg_mi.aoi.shares import Shares
+from nerg_mi.environment.bands import render_channels
 from nerg_mi.environment.environment import Environment
+from nerg_mi.environment.sampler import GazeSampler, sample_field
 from nerg_mi.evaluation.gaze_report import GazeResults, Verdict, compute_verdict, small_sample_factor
-from nerg_mi.fields.gaze_base import AnyGazeField
+from nerg_mi.fields.gaze_base import GazeNetwork
 from nerg_mi.figures.overlay import srgb, to_bytes
-from nerg_mi.formats.areas import Region
-from nerg_mi.maths.arrays import to_vector
-from nerg_mi.maths.types import variant_types
-from nerg_mi.measures.shares import DirectionQuery, Shares
-from nerg_mi.measures.visits import Aoi, HitAssignment, assign_hits, merge_members
-from nerg_mi.rays.quality import RaysSummary
-from nerg_mi.rays.rays import Rays
-from nerg_mi.rendering.bands import render_channels
-from nerg_mi.train.gaze_data import SURFACE_OPACITY
-from nerg_mi.transport.extrapolation import describe_extrapolation
-from nerg_mi.transport.geometry import default_march_settings, trace_depth
-from nerg_mi.transport.observer import ObserverSettings
-from nerg_mi.transport.observer_gaze import GazeFieldInstance, make_gaze_evaluator
+from nerg_mi.formats.boxes import Region
+from nerg_mi.tracking.quality import RaysSummary
+from nerg_mi.tracking.rays import Rays
 
 # ---- Gaze at sampled viewpoints ----
 #
@@ -48,63 +42,9 @@ class EyePositions:
     participant: np.ndarray
 
 
-class GazeSampler:
-    """Evaluate a gaze field in a scene for given observers.
-
-    Parameters
-    ----------
-    field
-        Gaze field.
-    geometry
-        Geometry of the scene. All coordinates are in its frame.
-    kind
-        Depth estimate of a ray in a medium, such as "median".
-    """
-
-    def __init__(self, field: AnyGazeField, geometry: Environment, kind: str = "median"):
-        self.field, self._kind = field, kind
-        self._geometry = geometry.scene_geometry
-        self._has_geometry = geometry.medium is not None
-        march = default_march_settings(self._geometry)
-        self._settings = ObserverSettings(
-            march=march, depth=kind, surface_opacity=SURFACE_OPACITY, directions=_NORMALIZATION_DIRECTIONS
-        )
-        self._gaze = GazeFieldInstance(field)
-
-    def trace(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the depth (N,) along rays (N, 3) and whether each hits a surface (N,). Without geometry, no ray
-        hits."""
-        if not self._has_geometry:
-            return np.zeros(len(origins), np.float32), np.zeros(len(origins), bool)
-        depth, opacity = trace_depth(self._geometry, origins, directions, kind=self._kind)
-        return depth, (opacity >= SURFACE_OPACITY) & (depth > 0)
-
-    def density(self, observer: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Return the gaze density (N,) of ``observer`` (3,) in unit ``directions`` (N, 3), in 1/sr."""
-        mi = variant_types()
-        center = mi.Point3f(*np.asarray(observer, float).tolist())
-        observed = self._gaze.for_observers([center], self._geometry, self._settings)
-        return np.array(observed.evaluate_along(center, to_vector(mi.Vector3f, directions)))
-
-    def density_at_points(self, observer: np.ndarray, points: np.ndarray, spacing: float) -> np.ndarray:
-        """Return the gaze density (N,) of ``observer`` (3,) towards surface ``points`` (N, 3), in 1/sr.
-
-        Points that are hidden by a surface more than two ``spacing`` in front of them have density 0.
-        """
-        to_points = points - observer
-        distance = np.linalg.norm(to_points, axis=1)
-        directions = to_points / np.maximum(distance, 1e-9)[:, None]
-        depth, is_hit = self.trace(np.broadcast_to(observer, points.shape), directions)
-        is_visible = ~is_hit | (depth >= distance - 2 * spacing)
-        return np.where(is_visible, self.density(observer, directions), 0)
-
-    def describe_extrapolation(self, observers: np.ndarray) -> str:
-        """Return a sentence on the ``observers`` (M, 3) whose gaze is extrapolated; "" if there are none."""
-        return describe_extrapolation(self._geometry, self._gaze, observers)
-
-    def query_from(self, observer: np.ndarray) -> DirectionQuery:
-        """Return the `DirectionQuery` of the observer at this position (3,), as `gaze_shares` needs it."""
-        return make_gaze_evaluator(self._gaze, self._geometry, self._settings, observer)
+def make_report_sampler(field: GazeNetwork, environment: Environment, kind: str = "median") -> GazeSampler:
+    """Return the gaze of ``field`` in an environment, with depths of ``kind``, such as "median"."""
+    return sample_field(field, environment, depth=kind, directions=_NORMALIZATION_DIRECTIONS)
 
 
 def sample_eye_positions(rays: Rays, geometry: Environment, max_positions: int) -> EyePositions:
@@ -157,7 +97,7 @@ def assign_ray_hits(
     members
         Indices into ``aois`` of each area.
     margin
-        Tolerance in scene units, as for `nerg_mi.measures.visits.assign_hits`.
+        Tolerance in scene units, as for `nerg_mi.aoi.placed.assign_hits`.
     """
     subset = rays if len(rays) <= max_rays else rays.select(np.linspace(0, len(rays) - 1, max_rays).round().astype(int))
     origins, directions = geometry.points_to_field(subset.origin), geometry.directions_to_field(subset.direction)

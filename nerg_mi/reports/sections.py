@@ -12,14 +12,15 @@ from importlib.resources import files
 from typing import Any
 
 from nerg_mi import __version__
+from nerg_mi.environment.radiance import describe_psnr
 from nerg_mi.evaluation.baselines import PRIOR
 from nerg_mi.evaluation.gaze import SPLIT_HALF
 from nerg_mi.evaluation.gaze_report import SPLIT_LABELS, Comparison, GazeResults, Verdict
 from nerg_mi.files.html import Html, element, figure, image, key_value_table, markup, paragraph, table
-from nerg_mi.rays.quality import WARNING_LABEL, make_quality_report
-from nerg_mi.rays.rays import TRACKING
+from nerg_mi.tracking.quality import WARNING_LABEL, make_quality_report
+from nerg_mi.tracking.rays import TRACKING
 from nerg_mi.tracking_kinds import read_tracking
-from nerg_mi.train.radiance_settings import use_current_names
+from nerg_mi.train.trainer import use_current_names
 
 from .charts import Point, interval_chart
 from .data import MeanShare, ObjectAttention, Run
@@ -271,9 +272,8 @@ def _scene_facts(run: Run) -> list[tuple[str, str]]:
         facts.append(("box", " × ".join(f"{e:.2f}" for e in edges) + " scene units (usually metres)"))
     if "training_frames" in provenance:
         facts.append(("training photos", f"{provenance['training_frames']}"))
-    psnr = provenance.get("psnr_held_out")
-    if isinstance(psnr, dict) and psnr.get("mean") is not None:
-        facts.append(("image quality", f"{psnr['mean']:.1f} dB PSNR on {len(psnr.get('views', ()))} held-out photos"))
+    if (psnr := describe_psnr(provenance)) is not None:
+        facts.append(("image quality", psnr))
     shape = (run.provenance.get("geometry_file") or {}).get("shape")
     if shape:
         facts.append(("hit points", " × ".join(map(str, shape)) + " voxels of the gaze hit points"))
@@ -602,8 +602,8 @@ def _show_verdict(run: Run) -> Html:
     verdicts = [element("div", verdict.sentence, class_=f"verdict {verdict.grade}") for _, verdict in run.verdicts]
     results = run.results[0]
     basis = (
-        f"Evaluated on {results.num_participants} held-out participants at {results.num_positions} held-out "
-        "positions. A gain counts "
+        f"Evaluated on {SPLIT_LABELS.get(results.split, results.split)} ({results.num_participants} participants, "
+        f"{results.num_positions} positions). A gain counts "
         "if its 95 % confidence interval over participants excludes zero. The verdict needs a gain in two of the three "
         f"scores (log score, CC, KLD) and a loss in none. The {PRIOR} is a baseline that ignores the "
         "observer's position. The strongest baseline is the one with the highest log score."

@@ -11,13 +11,13 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from nerg_mi.environment.surface_attention import Density, attention_per_sr
 from nerg_mi.errors import NergError, parameter
 from nerg_mi.maths.arrays import to_vector
 from nerg_mi.maths.types import Float, Point3f, Vector3f, variant_types
 from nerg_mi.maths.vmf import tangent_frame
-from nerg_mi.probes.surface_attention import Density, attention_per_sr
-from nerg_mi.rays.filters import find_sessions
-from nerg_mi.rays.rays import Rays
+from nerg_mi.tracking.filters import find_sessions
+from nerg_mi.tracking.rays import Rays
 from nerg_mi.transport.geometry import SceneGeometry
 from nerg_mi.transport.observer import ObserverCache, ObserverSettings
 from nerg_mi.transport.observer_gaze import GazeFieldInstance
@@ -267,8 +267,6 @@ def _test_visibility(target: SurfaceTarget, pieces: Pieces) -> np.ndarray:
 
 MAX_GAP = 0.5  # maximum time in seconds that a sample represents
 
-WEIGHTINGS = ("time", "person", "equal")
-"""Weightings of samples: by represented time, with equal total weight per participant, or equal."""
 
 _MAX_CELLS = 4096
 _MAX_ROUNDS = 50
@@ -518,8 +516,9 @@ def _directions_from_cylindrical(z: np.ndarray, phi: np.ndarray) -> np.ndarray:
 #
 # (Veach 1997, section 8.2.2.2). The integral is a sum over small pieces with their exact solid angles, the density at
 # their centres and their visible fractions. In a medium, or with a fall-off at occlusion boundaries, V is evaluated at
-# the centre by `nerg_mi.probes.surface_attention`. The total gaze, and the parts that hit other surfaces or escape, are
-# integrated over the sphere. The two quadratures use different points; their discrepancy is reported as the error.
+# the centre by `nerg_mi.environment.surface_attention`. The total gaze, and the parts that hit other surfaces or
+# escape, are integrated over the sphere. The two quadratures use different points; their discrepancy is reported as the
+# error.
 
 BATCH_SIZE = 1 << 18  # number of pieces per launch
 FACES_PER_BATCH = 1 << 16  # number of faces per subdivision batch
@@ -537,7 +536,7 @@ class GazeSumSettings:
 
 @dataclass(frozen=True, eq=False)
 class SurfaceObserver:
-    """An observer at ``center`` (one lane): ``density`` at surface points, as `nerg_mi.probes.surface_attention`
+    """An observer at ``center`` (one lane): ``density`` at surface points, as `nerg_mi.environment.surface_attention`
     needs it, and density along directions."""
 
     center: Point3f
@@ -669,7 +668,7 @@ def occluded_density(
     """Return the gaze density (N,) of an observer at surface ``points`` with ``normals`` (N, 3), in 1/sr, after
     occlusion.
 
-    ``penetration`` and ``falloff`` are as in `nerg_mi.probes.surface_attention`.
+    ``penetration`` and ``falloff`` are as in `nerg_mi.environment.surface_attention`.
     """
     mi = variant_types()
     p_o, p = observer.center + dr.zeros(mi.Point3f, len(points)), to_vector(mi.Point3f, points)

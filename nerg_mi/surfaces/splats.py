@@ -443,7 +443,7 @@ def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
 #
 #     g(ω) V(c, p_o) C(ω) / |c - p_o|²,    C(ω) = |Σ^{-1/2} ω| min σ,    ω = (c - p_o) / |c - p_o|
 #
-# This is the density of `nerg_mi.probes.surface_attention` at the centre, with the projected area relative to the
+# This is the density of `nerg_mi.environment.surface_attention` at the centre, with the projected area relative to the
 # largest one (C) in place of a cosine. V is the visibility of a point that lies before the centre by the thickness of
 # the Gaussian. The densities can be rendered as colours: they are blended by transmittance.
 

@@ -6,6 +6,7 @@ import asyncio
 import ipaddress
 import logging
 import math
+import os
 import pickle
 import re
 import signal
@@ -20,12 +21,14 @@ from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Annotated, Any
 
 from nerg_mi.errors import NergError, format_error
 from nerg_mi.files.atomic import create_folder_atomically, make_folder, write_bytes
 from nerg_mi.files.safe_read import read_bytes
-from nerg_mi.threads import get_worker_threads, limit_threads
+from nerg_mi.progress import Progress, open_reporter
+from nerg_mi.ranges import SECONDS, Range, check_ranges
+from nerg_mi.threads import THREADS_VARIABLE, get_worker_threads, limit_threads
 
 from .execution import MAX_ATTEMPTS, TaskResult, WarningCallback, run_task
 from .store import ResultManifest, Store, read_contents
@@ -560,30 +563,49 @@ def localize_inputs(
     return localized, relocate_paths(value, inputs, folder)
 
 
-def run_dask_worker(address: str, timeout: float, on_message: WarningCallback, name: str | None = None) -> None:
-    """Run a Dask worker for the scheduler at ``address`` until the scheduler or Ctrl-C stops it.
+@check_ranges
+def run_worker(
+    address: str,
+    *,
+    threads: Annotated[int, Range(0, 1024)] = 0,
+    wait: Annotated[float, SECONDS] = 600.0,
+    progress: Progress = None,
+) -> None:
+    """Run parts of jobs for a dask scheduler, one at a time, until the scheduler stops the worker or Ctrl-C is pressed.
 
-    The worker has one Dask thread, and its process is restarted if it dies. Raises `NergError` if no scheduler answers.
+    Start one worker per machine or GPU; it uses all of it. Jobs are sent there with --scheduler. The process of a
+    worker that dies is started again.
 
     Parameters
     ----------
-    address
-        Address of the scheduler.
-    timeout
-        Seconds to wait for the scheduler.
-    on_message
-        Callback for status messages.
-    name
-        Unique name of the worker at the scheduler.
+    address : str
+        Address of the dask scheduler: tcp://HOST:PORT or tls://HOST:PORT.
+    threads : int
+        Number of CPU threads; 0: one per core.
+    wait : float
+        Time in seconds to wait for a scheduler that does not answer before the worker ends.
+    progress : bool, Reporter or None
+        Progress and messages (`nerg_mi.progress.Progress`).
+
+    Raises
+    ------
+    NergError
+        No scheduler answers.
     """
+    if threads:
+        os.environ[THREADS_VARIABLE] = str(threads)
     check_address(address)
-    import_distributed()
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
-    try:
-        asyncio.run(_serve_async(address, timeout, on_message, name, make_security(address)))
-    except asyncio.CancelledError:
-        # The SIGTERM of a batch system stops the worker in the same way as Ctrl-C, including the cleanup.
-        raise KeyboardInterrupt from None
+    with open_reporter(progress) as reporter:
+        warning = describe_exposure(address)
+        if warning is not None:
+            reporter.warn(warning)
+        import_distributed()
+        logging.getLogger("distributed").setLevel(logging.CRITICAL)
+        try:
+            asyncio.run(_serve_async(address, wait, reporter.message, make_security(address)))
+        except asyncio.CancelledError:
+            # The SIGTERM of a batch system stops the worker in the same way as Ctrl-C, including the cleanup.
+            raise KeyboardInterrupt from None
 
 
 async def _wait_for_scheduler(address: str, timeout: float, on_message: WarningCallback, security: Any) -> None:
@@ -604,16 +626,14 @@ async def _wait_for_scheduler(address: str, timeout: float, on_message: WarningC
         await asyncio.sleep(min(POLL_INTERVAL, max(left, 0.0)))
 
 
-async def _serve_async(
-    address: str, timeout: float, on_message: WarningCallback, name: str | None, security: Any
-) -> None:
+async def _serve_async(address: str, timeout: float, on_message: WarningCallback, security: Any) -> None:
     import dask.config
 
     serving = asyncio.current_task()
     assert serving is not None
     asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, serving.cancel)
     # The system limits the memory, this package controls the threads, and a dashboard would open another port.
-    settings = {"nthreads": 1, "memory_limit": 0, "dashboard": False, "host": find_local_host(address), "name": name}
+    settings = {"nthreads": 1, "memory_limit": 0, "dashboard": False, "host": find_local_host(address)}
     settings |= {"dashboard_address": "127.0.0.1:0", "security": security, "death_timeout": timeout}
     settings |= {"silence_logs": logging.CRITICAL}
     with (

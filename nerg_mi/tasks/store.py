@@ -426,7 +426,7 @@ def _check_job(
     return status, set(plan.keys) - outdated
 
 
-def remove_stale(store: Store, status: StoreStatus) -> int:
+def delete_stale(store: Store, status: StoreStatus) -> int:
     """Remove the stale outputs and leftovers of ``status`` from ``store``. Returns the number of freed bytes."""
     for manifest in status.stale:
         store.remove(manifest.key, manifest.suffix)

@@ -1,7 +1,8 @@
-"""Compilation of a radiance field: its density on voxels, so that it renders faster."""
+"""Faster radiance fields: compilation, which stores the density on voxels, and a finer occupancy grid."""
 
 from __future__ import annotations
 
+import copy
 import time
 from dataclasses import asdict, dataclass
 from typing import Annotated, Any
@@ -9,10 +10,11 @@ from typing import Annotated, Any
 import drjit as dr
 import numpy as np
 
-from nerg_mi.environment.trained import TrainedField, open_field
+from nerg_mi.environment.radiance import RadianceField
 from nerg_mi.errors import NergError, parameter
 from nerg_mi.fields.compilation import attach_voxels, compile_density
-from nerg_mi.fields.radiance import RadianceField
+from nerg_mi.fields.occupancy import refine_occupancy
+from nerg_mi.fields.radiance import RadianceNetwork
 from nerg_mi.fields.voxels import BLOCK_EDGE, MAX_RESOLUTION, VoxelGrid
 from nerg_mi.files.values import FilePath
 from nerg_mi.maths.arrays import to_vector
@@ -22,9 +24,11 @@ from nerg_mi.ranges import LENGTHS, Range, check_ranges
 from nerg_mi.transport.field_medium import FieldMedium, make_color_shader
 from nerg_mi.transport.geometry import SceneGeometry, default_march_settings
 
-_FIRST_RESOLUTION = 256
+_RESOLUTIONS = [256, 512, 1024, MAX_RESOLUTION]
 _RAYS = 1 << 15  # Rays by which a compiled field is compared with its field
 _REPEATS = 3  # Renderings of these rays, of which the fastest one counts
+
+# ---- Compilation ----
 
 
 @dataclass(frozen=True)
@@ -46,22 +50,23 @@ class CompiledError:
 
 @check_ranges
 def compile_field(
-    field: TrainedField[RadianceField] | FilePath,
+    field: RadianceField | FilePath,
     *,
     resolution: Annotated[int, Range(0, 2048)] = 0,
     max_depth_error: Annotated[float, LENGTHS] | None = None,
     min_psnr: Annotated[float, Range(0, 120)] = 40.0,
     memory: Annotated[float, Range(1, 16384)] = 300.0,
     progress: Progress = None,
-) -> TrainedField[RadianceField]:
+) -> RadianceField:
     """Evaluate the density of a radiance field on voxels once, so that frames take about half the time.
 
-    The compiled field is compared with the field along random rays. Colour still comes from the networks, and gaze
-    fields that were trained in the field accept the compiled one.
+    The compiled field is compared with the field along random rays, the same for the choice of the resolution and for
+    the errors that are reported. Colour still comes from the networks, and gaze fields that were trained in the field
+    accept the compiled one.
 
     Parameters
     ----------
-    field : TrainedField or path
+    field : RadianceField or path
         Radiance field (.safetensors).
     resolution : int
         Number of voxels along the longest edge of the field's bounding box, a multiple of 8. 0: double it from 256 on
@@ -77,7 +82,7 @@ def compile_field(
 
     Returns
     -------
-    TrainedField
+    RadianceField
         The compiled field. ``provenance["compiled"]`` has its resolution, its size in bytes, its depth errors in scene
         units, the PSNR of its colour in dB and the speed-up.
 
@@ -95,7 +100,7 @@ def compile_field(
     >>> small.provenance["compiled"]["resolution"]
     128
     """
-    original = open_field(field)
+    original = RadianceField.open(field)
     network = original.network
     if resolution % BLOCK_EDGE:
         raise NergError(f"{parameter('resolution')} must be a multiple of {BLOCK_EDGE}, got {resolution}")
@@ -103,7 +108,7 @@ def compile_field(
         raise NergError("this field is compiled already; compile the field that it was made from")
     network.require_density("the radiance field")
     max_depth_error = max_depth_error or 0.1 * (network.march_step or network.box.diagonal / 1024)
-    resolutions = [resolution] if resolution else _list_resolutions()
+    resolutions = [resolution] if resolution else _RESOLUTIONS
     rays = _make_rays(network)
     reference, seconds = _render(network, rays)
     voxels = result = None
@@ -122,7 +127,11 @@ def compile_field(
             compiled = attach_voxels(network, voxels)
             pixels, compiled_seconds = _render(compiled, rays)
             error = _compare(reference, pixels, voxels, seconds / compiled_seconds)
-            reporter.message(_describe(error))
+            reporter.message(
+                f"{error.resolution} cells along an edge, {error.size / 1e6:.0f} MB: depth differs by "
+                f"{error.depth_median:.2g} (99 %: {error.depth_99:.2g}), colour by {error.psnr:.1f} dB, "
+                f"{error.speedup:.1f} times as fast"
+            )
             result = original.derive(compiled, compiled=asdict(error))
             if error.psnr >= min_psnr and error.depth_median <= max_depth_error:
                 break
@@ -136,14 +145,7 @@ def compile_field(
     return result
 
 
-def _list_resolutions() -> list[int]:
-    resolutions = [_FIRST_RESOLUTION]
-    while 2 * resolutions[-1] <= MAX_RESOLUTION:
-        resolutions.append(2 * resolutions[-1])
-    return resolutions
-
-
-def _make_rays(field: RadianceField) -> tuple[Any, Any]:
+def _make_rays(field: RadianceNetwork) -> tuple[Any, Any]:
     """Origins and unit directions of random rays that start in empty space of the core of ``field``."""
     rng, ns = np.random.default_rng(0), field.ns
     core, occupancy = field.box.core, field.occupancy
@@ -157,7 +159,7 @@ def _make_rays(field: RadianceField) -> tuple[Any, Any]:
     return points[:_RAYS], directions.astype(np.float32)
 
 
-def _render(field: RadianceField, rays: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, float]:
+def _render(field: RadianceNetwork, rays: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, float]:
     """Colour times opacity, opacity and depth (N, 5) of rays, and the seconds of a rendering of them."""
     mi: Any = variant_types()
     medium = FieldMedium(field)
@@ -190,8 +192,58 @@ def _compare(reference: np.ndarray, compiled: np.ndarray, voxels: VoxelGrid, spe
     return CompiledError(voxels.resolution, voxels.size, median, high, -10 * np.log10(max(mse, 1e-12)), speedup)
 
 
-def _describe(error: CompiledError) -> str:
-    return (
-        f"{error.resolution} cells along an edge, {error.size / 1e6:.0f} MB: depth differs by {error.depth_median:.2g} "
-        f"(99 %: {error.depth_99:.2g}), colour by {error.psnr:.1f} dB, {error.speedup:.1f} times as fast"
-    )
+# ---- Refinement of the occupancy grid ----
+
+
+def refine_field(field: RadianceField | FilePath, *, progress: Progress = None) -> RadianceField:
+    """Compute a finer occupancy grid of a radiance field, so that it renders with fewer evaluations.
+
+    Training and nerg import compute this grid already; the function is for older files. The weights do not change, and
+    gaze fields that were trained in the field accept the new one.
+
+    Parameters
+    ----------
+    field : RadianceField or path
+        Radiance field (.safetensors).
+    progress : bool, Reporter or None
+        Progress and messages (`nerg_mi.progress.Progress`).
+
+    Returns
+    -------
+    RadianceField
+        The field with the finer grid.
+
+    Raises
+    ------
+    NergError
+        The field has no occupancy grid, or one of nested cubes.
+
+    Examples
+    --------
+    >>> import nerg_mi as nerg
+    >>> from importlib.resources import files
+    >>> field = nerg.load_field(files("nerg_mi.scenes.store") / "store.safetensors")
+    >>> fine = nerg.refine_field(field)
+    >>> fine.network.occupancy.occupied_fraction < field.network.occupancy.coarse.occupied_fraction
+    True
+    """
+    original = RadianceField.open(field)
+    before = original.network.occupancy
+    if before is None:
+        raise NergError(f'"{original.name}" has no occupancy grid to refine: rays are marched through its whole box')
+    with open_reporter(progress) as reporter:
+        reporter.progress(0.0, f"refining {original.name}")
+        grid = refine_occupancy(original.network)
+        if grid is None:
+            raise NergError(
+                f'the occupancy grid of "{original.name}" consists of nested cubes, which cannot be refined: use the '
+                "field as it is"
+            )
+        reporter.message(
+            f"occupied: {100 * grid.occupied_fraction:.2f} % of the box, before "
+            f"{100 * before.coarse.occupied_fraction:.2f} %; a random line misses an optical depth of "
+            f"{grid.missed_optical_depth:.1e}"
+        )
+    network = copy.copy(original.network)
+    network.occupancy = grid
+    return original.derive(network)

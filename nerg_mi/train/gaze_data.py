@@ -1,4 +1,4 @@
-"""Training data of a gaze field: targets from gaze rays and salience views, batches, splits and the prior table."""
+"""Training data of a gaze field: gaze rays and salience views, their targets and batches."""
 
 from __future__ import annotations
 
@@ -14,157 +14,20 @@ from scipy.spatial.transform import Rotation
 
 from nerg_mi.environment.environment import DEFAULT_DEPTH, Environment
 from nerg_mi.errors import NergError, parameter
-from nerg_mi.fields.gaze_base import GazeHeadConfig, RaySupport, add_prior_floor, make_prior_table, table_directions
-from nerg_mi.fields.kde import SphericalKde
+from nerg_mi.fields.gaze_base import GazeHeadConfig, RaySupport
 from nerg_mi.maths.arrays import to_vector
 from nerg_mi.maths.geometry import AnyBox, intersect_box_numpy
 from nerg_mi.maths.sphere import fibonacci_directions, sort_directions
 from nerg_mi.maths.types import variant_types
 from nerg_mi.photos.salience import SalienceView
-from nerg_mi.probes.probes import Probes, compute_participant_weights, place_probes
-from nerg_mi.rays.filters import purge, split_by_person, split_by_position
-from nerg_mi.rays.rays import Rays
-from nerg_mi.transport.field_medium import FieldMedium, accumulate_features, evaluate_features
-from nerg_mi.transport.geometry import SceneGeometry, default_march_settings, trace_depth
+from nerg_mi.tracking.probes import Probes, place_probes
+from nerg_mi.tracking.rays import Rays
+from nerg_mi.transport.field_medium import FieldMedium, features_for_observer
+from nerg_mi.transport.geometry import SURFACE_OPACITY, SceneGeometry, default_march_settings, trace_depth
 from nerg_mi.transport.observer_gaze import interpolate_nearest_depth
 
-from .gaze_settings import MIN_MEAN_DENSITY, GazeSettings, ProbeSettings
-
-# ---- Position-independent prior: the gaze density averaged over all positions ----
-
-DEFAULT_PRIOR_KAPPA = 30.0  # Concentration of its kernels
-PRIOR_KAPPAS = (2.0, 5.0, 10.0, 20.0, 30.0, 50.0, 100.0)
-"""Candidate concentrations of the prior's kernels."""
-# Maximum numbers of rays in a prior, and of a participant's rays that it predicts, while its kernels are selected
-_MAX_SELECTION_RAYS, _MAX_PARTICIPANT_RAYS = 1 << 14, 512
-_MAX_PRIOR_RAYS = 1 << 16  # Maximum number of rays in the prior
-_VIEWS_KAPPA = 50.0  # Concentration of the kernels that smooth a prior estimated from views
-_LEAF_SIZE = 16  # Points per leaf of a KD-tree. The value decides ties between equally distant directions.
-_ITERATIONS = 100  # Iterations of the estimate from views
-_QUADRATURE_DIRECTIONS = 1 << 16  # Directions of the quadrature that normalises the table
-
-
-def check_prior_kappa(rows: int, kappa: float | None) -> None:
-    """Raise `NergError` if kernels of concentration ``kappa`` are narrower than half a texel of a table of ``rows``
-    rows.
-    """
-    if kappa is not None and kappa > (max_kappa := (2 * rows / np.pi) ** 2):
-        raise NergError(
-            f"the position-independent prior is stored in a table of {rows} rows, which does not resolve kernels of "
-            f"concentration {kappa:g}; use a concentration of at most {max_kappa:.0f}"
-        )
-
-
-def make_prior_from_rays(
-    rays: Rays,
-    rows: int,
-    geometry: Environment | None = None,
-    seed: int = 0,
-    weights: str = "equal",
-    kappa: float | None = None,
-) -> np.ndarray:
-    """Estimate the position-independent prior from gaze rays by kernel density estimation.
-
-    Parameters
-    ----------
-    rays : Rays
-        Gaze rays, in their own frame.
-    rows : int
-        Rows of the table.
-    geometry : Environment, optional
-        Its frame is the frame of the table. Default: the frame of the rays.
-    seed : int
-        Seed of the subsample of rays.
-    weights : str
-        ``"person"`` gives each participant the same total weight; other values weight each ray equally.
-    kappa : float, optional
-        Concentration of each ray's kernel; see `check_prior_kappa`.
-
-    Returns
-    -------
-    numpy.ndarray
-        Table (rows, 2 rows) as returned by ``fields.gaze_base.make_prior_table``.
-    """
-    check_prior_kappa(rows, kappa)
-    subset = np.random.default_rng(seed).permutation(len(rays))[:_MAX_PRIOR_RAYS]
-    ray_weights = compute_participant_weights(rays)[subset] if weights == "person" else None
-    kappa = DEFAULT_PRIOR_KAPPA if kappa is None else kappa
-    kde = SphericalKde(rays.direction[subset], np.array([0, len(subset)]), kappa, ray_weights)
-    directions = table_directions(rows)
-    density = kde.evaluate(directions if geometry is None else geometry.directions_to_rays(directions))[0]
-    return make_prior_table(density, rows, kde.ns, fibonacci_directions(_QUADRATURE_DIRECTIONS))
-
-
-def select_prior_kappa(rays: Rays, weights: str = "equal", seed: int = 0) -> float:
-    """Select the concentration of the prior's kernels by leaving out participants.
-
-    The prior of the other participants predicts each participant; with one, the first half of the rays in time predicts
-    the second. The result is the geometric mean of the best of `PRIOR_KAPPAS` and `DEFAULT_PRIOR_KAPPA`: the best one
-    alone varies with the training participants more than with those who are predicted.
-
-    Parameters
-    ----------
-    rays : Rays
-        Training rays.
-    weights : str
-        Weights of the rays in the prior (`make_prior_from_rays`).
-    seed : int
-        Seed of the subsamples.
-    """
-    participants, rng = np.unique(rays.person), np.random.default_rng(seed)
-    tests = [rays.person == p for p in participants] if len(participants) > 1 else [rays.t > np.median(rays.t)]
-    scores = []
-    for test in tests:
-        if test.all() or not test.any():
-            continue
-        held_out = rays.direction[rng.permutation(np.flatnonzero(test))[:_MAX_PARTICIPANT_RAYS]]
-        train = rays.select(np.sort(rng.permutation(np.flatnonzero(~test))[:_MAX_SELECTION_RAYS]))
-        ray_weights = compute_participant_weights(train) if weights == "person" else None
-        mixture = np.array([0, len(train)])
-        density = [SphericalKde(train.direction, mixture, k, ray_weights).evaluate(held_out)[0] for k in PRIOR_KAPPAS]
-        scores.append(np.log(add_prior_floor(np.array(density, np.float64))).mean(axis=1))
-    best = PRIOR_KAPPAS[int(np.mean(scores, axis=0).argmax())] if scores else DEFAULT_PRIOR_KAPPA
-    return float(np.sqrt(best * DEFAULT_PRIOR_KAPPA))
-
-
-def make_prior_from_views(views: Sequence[SalienceView], rows: int) -> np.ndarray:
-    """Estimate the position-independent prior from salience views, each of which covers a part of the sphere.
-
-    Returns a table (rows, 2 rows) as ``fields.gaze_base.make_prior_table`` does.
-
-    Notes
-    -----
-    The estimate b maximises the likelihood if view v samples b conditioned on its visible part. It is found with the
-    minorise-maximise iteration of Hunter (2004) for the Bradley-Terry and Plackett-Luce models: b = Σ_v p_v / Σ_v 1_v /
-    b(v). One additional uniform view of the whole sphere connects views that do not overlap. Directions outside every
-    view take the value of the nearest direction inside one.
-    """
-    from scipy.spatial import KDTree
-
-    directions = table_directions(rows)
-    # Solid angles of the latitude bands, which sum to exactly 4π.
-    edges = np.cos(np.arange(rows + 1) * np.pi / rows)
-    area = np.repeat((edges[:-1] - edges[1:]) * np.pi / rows, 2 * rows)
-    density, is_visible = np.empty((len(views), len(area)), np.float32), np.empty((len(views), len(area)), bool)
-    for k, view in enumerate(views):
-        # Reduce the view so that its pixels are not finer than the texels.
-        density[k], is_visible[k] = view.reduce(max(1, round(view.total_solid_angle / area.max()))).evaluate(directions)
-    # A view that falls between the texel centres contributes nothing.
-    visible_gaze = density @ area
-    is_visible &= visible_gaze[:, None] > 0
-    target = (density / np.maximum(visible_gaze, 1e-30)[:, None]).sum(axis=0, dtype=np.float64) + 1 / (4 * np.pi)
-    prior = np.full(len(area), 1 / (4 * np.pi))
-    for _ in range(_ITERATIONS):
-        visible_prior = is_visible @ (prior * area)
-        prior = target / (is_visible.T @ (1 / np.maximum(visible_prior, 1e-30) * (visible_prior > 0)) + 1)
-        prior /= prior @ area
-    is_covered = is_visible.any(axis=0)
-    if is_covered.any():
-        prior = prior[
-            np.flatnonzero(is_covered)[KDTree(directions[is_covered], leafsize=_LEAF_SIZE).query(directions)[1]]
-        ]
-    kde = SphericalKde(directions, np.array([0, len(area)]), _VIEWS_KAPPA, prior * area)
-    return make_prior_table(kde.evaluate(directions)[0], rows, kde.ns, fibonacci_directions(_QUADRATURE_DIRECTIONS))
+from .gaze_settings import MIN_MEAN_DENSITY, ProbeSettings
+from .prior import make_prior_from_rays, make_prior_from_views
 
 
 def compute_observer_bounds(positions: np.ndarray, box: AnyBox) -> tuple[tuple[float, ...], tuple[float, ...]]:
@@ -214,17 +77,13 @@ def compute_semantic_features(
     if not isinstance(medium, FieldMedium):
         raise NergError(f"semantic features need a radiance field; pass one with {parameter('field')}")
     out = np.empty((len(origins), medium.feature_count), np.float16)
+    scene, march = SceneGeometry(medium), default_march_settings(medium)
     with dr.suspend_grad():
         for a in range(0, len(out), FEATURE_BATCH):
             part = slice(a, a + FEATURE_BATCH)
             o, d = to_vector(mi.Point3f, origins[part]), to_vector(mi.Vector3f, directions[part])
-            if kind == "snapshot":
-                t = mi.Float(np.ascontiguousarray(distance[part], np.float32))
-                features = evaluate_features(medium, o + d * t, mi.Bool(True))
-            else:
-                features = accumulate_features(
-                    SceneGeometry(medium), mi.Ray3f(o, d), mi.Bool(True), default_march_settings(medium)
-                )
+            p = o + d * mi.Float(np.ascontiguousarray(distance[part], np.float32))
+            features = features_for_observer(kind, scene, p, o, d, mi.Bool(True), march) or []
             # Evaluate all features in one kernel; separate evaluations would repeat the march or the network.
             dr.eval(features)
             out[part] = np.stack([np.array(f) for f in features], axis=-1)
@@ -285,163 +144,7 @@ def _hash_arrays(arrays: list[np.ndarray]) -> str:
     return hashlib.sha256(b"".join(np.ascontiguousarray(a).tobytes() for a in arrays)).hexdigest()
 
 
-# ---- Splits ----
-#
-# Positions and participants that are held out for testing, and positions that are held out for validation.
-
-_VALIDATION_FRACTION = 0.12  # Fraction of the views held out for validation
-
-
-@dataclass(frozen=True, eq=False)
-class ValidationSplit:
-    """Training and validation data of the first fit."""
-
-    training: Supervision  # Data to train on
-    validation: Supervision | None = None  # Data to validate on; None: no validation
-    # Positions (T, 3) of the validation probes in the frame of the rays; None: at the views
-    centres: np.ndarray | None = None
-    rays_held_out: int = 0  # Rays and views excluded from the training data
-    views_held_out: int = 0
-
-
-def split_validation(
-    supervision: Supervision, geometry: Environment, settings: GazeSettings, probes: ProbeSettings
-) -> ValidationSplit:
-    """Hold out zones of positions for validation, as many as ``settings.validation_zones``.
-
-    Training data within 2R of a validation position are removed, where R is the probe radius: rays and views, or only
-    views if there are no rays.
-
-    Raises `NergError` if too little training data would remain.
-    """
-    rays, views = supervision.rays, supervision.views
-    if not settings.validation_zones:
-        return ValidationSplit(supervision)
-    if rays is None:
-        train, validation = split_views(views, settings.validation_zones, 2 * probes.radius, settings.seed + 1)
-        return ValidationSplit(
-            Supervision(None, tuple(train)),
-            Supervision(None, tuple(validation)),
-            views_held_out=len(views) - len(train),
-        )
-    split = split_by_position(
-        rays,
-        probes.radius,
-        zones=settings.validation_zones,
-        test_probes=settings.validation_probes,
-        min_rays=settings.validation_min_rays or probes.min_rays,
-        seed=settings.seed + 1,
-    )
-    far_from_test = select_far_views(
-        views, geometry.points_to_field(split.test_centres), 2 * probes.radius * geometry.align.scale
-    )
-    return ValidationSplit(
-        Supervision(rays.select(split.train), tuple(far_from_test)),
-        # Validation uses all rays around the centres, because the truth is the gaze of everybody who was there.
-        Supervision(rays),
-        split.test_centres,
-        rays_held_out=int((~split.train).sum()),
-        views_held_out=len(views) - len(far_from_test),
-    )
-
-
-def hold_out(
-    rays: Rays,
-    radius: float,
-    zones: int,
-    positions: int,
-    seed: int = 0,
-    min_rays: int = 64,
-    participant_fraction: float = 0.0,
-) -> tuple[Rays, dict]:
-    """Hold out test positions, and optionally participants.
-
-    Parameters
-    ----------
-    rays : Rays
-        All gaze rays.
-    radius : float
-        Probe radius R in metres. Rays within 2R of a test position are removed (``rays.filters``), so that no training
-        probe comes within R of one.
-    zones, positions : int
-        Number of zones and total number of test positions.
-    seed : int
-        Seed of the split.
-    min_rays : int
-        Minimum number of rays around a test position.
-    participant_fraction : float
-        Fraction of the participants to hold out everywhere; the test positions are then chosen among theirs. 0 holds
-        out none.
-
-    Returns
-    -------
-    train : Rays
-        Rays to train on.
-    holdout : dict
-        Description of the split (JSON), with the test ``centres`` in the frame of the rays and the names of the
-        held-out participants (``people``).
-    """
-    is_training, names = np.ones(len(rays), bool), []
-    test_rays = rays
-    if participant_fraction:
-        is_training, is_held_out = split_by_person(rays, test_fraction=participant_fraction, seed=seed)
-        names = [rays.persons[i] for i in np.unique(rays.person[is_held_out])]
-        test_rays = rays.select(is_held_out)
-    split = split_by_position(test_rays, radius, zones=zones, test_probes=positions, min_rays=min_rays, seed=seed)
-    train = is_training & purge(rays, split.test_centres, 2 * radius)
-    holdout = {
-        "centres": split.test_centres.round(6).tolist(),
-        "zone": split.zone.tolist(),
-        "radius": radius,
-        "purged_within": 2 * radius,
-        "seed": seed,
-        "rays": len(rays),
-        "rays_to_train": int(train.sum()),
-        "rays_near_tests": int(split.test.sum()),
-        "people": names,
-    }
-    return rays.select(train), holdout
-
-
-def split_views(
-    views: Sequence[SalienceView], zones: int, distance: float, seed: int = 0
-) -> tuple[list[SalienceView], list[SalienceView]]:
-    """Split views into ``(training, validation)``.
-
-    An eighth of the views, in ``zones`` groups of neighbours, are held out for validation. Views within ``distance`` of
-    a validation view are excluded from training.
-
-    Raises `NergError` if too few views would remain.
-    """
-    centres = np.array([v.camera.center for v in views])
-    rng = np.random.default_rng(seed)
-    seeds = [int(rng.integers(len(views)))]
-    distances = np.full(len(views), np.inf)
-    while len(seeds) < min(zones, len(views)):
-        distances = np.minimum(distances, np.linalg.norm(centres - centres[seeds[-1]], axis=1))
-        seeds.append(int(rng.choice(np.argsort(-distances)[: max(1, len(views) // 4)])))
-    group_size = max(1, round(_VALIDATION_FRACTION * len(views) / len(seeds)))
-    seed_distances = np.linalg.norm(centres[:, None] - centres[seeds], axis=2)
-    validation = np.unique(np.argsort(seed_distances, axis=0, kind="stable")[:group_size])
-    train = select_far_views(views, centres[validation], distance)
-    if len(train) < max(2, len(views) // 4):
-        raise NergError(
-            f"only {len(train)} of {len(views)} views remain for training; the others are validation views or "
-            f"within {distance:g} of one; use fewer {parameter('validation_zones')} (0: no validation) or a "
-            f"smaller {parameter('radius')}"
-        )
-    return train, [views[k] for k in validation]
-
-
-def select_far_views(views: Sequence[SalienceView], points: np.ndarray, distance: float) -> list[SalienceView]:
-    """Return the ``views`` whose camera is farther than ``distance`` from each of ``points`` (T, 3), all in one
-    frame."""
-    return [v for v in views if np.linalg.norm(points - v.camera.center, axis=1).min(initial=np.inf) > distance]
-
-
 # ---- Surface distances along observer rays ----
-
-SURFACE_OPACITY = 0.5  # Opacity from which a ray counts as hitting a surface; the integrator's default
 
 
 def compute_surface_distances(
@@ -725,20 +428,17 @@ class TargetArrays:
         if self._features:
             F = self._features
             semantic = [ns.Float(dr.gather(ns.Float16, self._semantic, index * F + k)) for k in range(F)]
+        full_sphere = np.full(len(observers), 4 * np.pi, np.float32)
         return GazeBatch(
             p_o,
             r_o,
             p_od,
             dr.gather(ns.Float, self._truth, index),
             dr.gather(ns.Bool, self._misses, index),
-            self._gather_solid_angles(observers),
+            ns.Float(full_sphere if self._solid_angle is None else self._solid_angle[observers]),
             semantic,
             self._solid_angle is not None,
         )
-
-    def _gather_solid_angles(self, observers: np.ndarray) -> Any:
-        full_sphere = np.full(len(observers), 4 * np.pi, np.float32)
-        return self.ns.Float(full_sphere if self._solid_angle is None else self._solid_angle[observers])
 
 
 # ---- Targets from gaze rays ----

@@ -13,28 +13,27 @@ import numpy as np
 
 from nerg_mi.environment.environment import Environment
 from nerg_mi.errors import NergError, parameter
-from nerg_mi.fields.gaze_base import AnyGazeField, GazeEnsemble, GazeHead, summarize_provenance
+from nerg_mi.fields.gaze_base import GazeEnsemble, GazeHead, GazeNetwork, summarize_provenance
 from nerg_mi.files.schema import check_json
 from nerg_mi.formats.checkpoint import read_checkpoint
 from nerg_mi.formats.fields import load_gaze, save_gaze
 from nerg_mi.photos.salience import SalienceView
-from nerg_mi.rays.rays import Rays
+from nerg_mi.tracking.rays import Rays
 
 from .gaze_data import Supervision
 from .gaze_folds import (
     FOLD_TIME_FRACTION,
     SELECTION_KEY,
-    StagedProgress,
     compute_fold_cost,
     evaluate_folds,
-    scale_progress,
     select_variant,
     selects_prior_weight,
 )
-from .gaze_run import train_gaze
+from .gaze_recipes import GazePlan
+from .gaze_run import KIND as RUN
+from .gaze_run import StateSettings, fit_gaze, read_run_identity
 from .gaze_settings import GazeSettings
-from .gaze_trainer import KIND as RUN
-from .gaze_trainer import GazePlan, ProgressCallback, StateSettings, read_run_identity
+from .gaze_trainer import ProgressCallback, StagedProgress, scale_progress
 from .trainer import check_same_run, reading_run_state, saving_on_failure
 
 MIN_BLOCKS = 5  # Minimum number of blocks for resampling; participants are the blocks if there are at least this many
@@ -145,7 +144,12 @@ def train_ensemble(
     on_progress = on_progress or (lambda progress: None)
     progress, fold_cost = StagedProgress(on_progress), compute_fold_cost(plan)
     report = progress.start(fold_cost, members)
-    plan, selection = select_variant(supervision, geometry, plan, ns, report, _read_identity(state, parts, ns))
+    if state.resume and not is_file(path):
+        # Between two members: what the ensemble was started with is recorded in those that are finished.
+        resumed = load_gaze(next(part for part in parts if part and is_file(part)), ns)[1]["provenance"]["about"]
+    else:
+        resumed = read_run_identity(state)
+    plan, selection = select_variant(supervision, geometry, plan, ns, report, resumed)
     if selection is not None:
         state = replace(state, identity={**state.identity, SELECTION_KEY: selection.to_dict()})
     full_plan, plan = plan, plan.with_settings(prior_folds=0)
@@ -159,12 +163,16 @@ def train_ensemble(
         member_state = replace(state, identity={**state.identity, "member": [k, members]})
         member_plan = plan.with_settings(seed=plan.settings.seed + 100 * k)
         # The identity describes the original rays, from which the resamples are drawn.
-        identity = member_plan.make_identity(supervision, geometry, member_state)
+        identity = {**member_state.identity, **member_plan.make_identity(supervision, geometry)}
         if state.resume and part is not None and part.is_file():
             field, provenance = _load_member(part, identity, member_state, ns)
         else:
-            field, provenance = train_gaze(
-                _resample_supervision(supervision, (plan.settings.seed, k)),
+            rays, views, draw = supervision.rays, supervision.views, (plan.settings.seed, k)
+            resampled = Supervision(
+                None if rays is None else resample_rays(rays, draw), resample_views(views, draw) if views else ()
+            )
+            field, provenance = fit_gaze(
+                resampled,
                 geometry,
                 member_plan,
                 ns,
@@ -203,13 +211,6 @@ def train_ensemble(
     return TrainedEnsemble(ensemble, provenance)
 
 
-def _read_identity(state: StateSettings, parts: list[Path | None], ns: ModuleType) -> dict | None:
-    """What an ensemble that is gone on with has been started as, by the first of its files; None for a new one."""
-    if not state.resume or (state.path is not None and state.path.is_file()):
-        return read_run_identity(state)
-    return next((load_gaze(p, ns)[1]["provenance"]["about"] for p in parts if p is not None and p.is_file()), None)
-
-
 def _get_resampling_kind(members: int, supervision: Supervision, plan: GazePlan) -> str:
     """Return the kind of resampling block. Raises `NergError` if the data cannot be resampled."""
     if members < 2:
@@ -225,15 +226,7 @@ def _get_resampling_kind(members: int, supervision: Supervision, plan: GazePlan)
     return f"{kind} and {VIEWS}" if supervision.views else kind
 
 
-def _resample_supervision(supervision: Supervision, seed: tuple[int, int]) -> Supervision:
-    """Return the resampled supervision of a member."""
-    rays, views = supervision.rays, supervision.views
-    return Supervision(
-        None if rays is None else resample_rays(rays, seed), resample_views(views, seed) if views else ()
-    )
-
-
-def _load_member(part: Path, identity: dict, state: StateSettings, ns: ModuleType) -> tuple[AnyGazeField, dict]:
+def _load_member(part: Path, identity: dict, state: StateSettings, ns: ModuleType) -> tuple[GazeNetwork, dict]:
     """Load a member that an earlier process has finished, and its provenance. Raises `NergError` if it belongs to
     another run.
     """

@@ -1,4 +1,4 @@
-"""Cross-validation of gaze fields that selects their architecture and the weight of the prior."""
+"""Held-out gaze: splits for tests and validation, and folds that select the architecture and the prior's weight."""
 
 from __future__ import annotations
 
@@ -17,10 +17,12 @@ from nerg_mi.fields.gaze_base import GazeHead, GazeHeadConfig, interpolate_table
 from nerg_mi.fields.gaze_hits import MAX_HITS, NearestOrigins, ReaimedHits, place_missing_points
 from nerg_mi.interruption import Interruption
 from nerg_mi.maths.arrays import to_vector
-from nerg_mi.probes.probes import calibrate_levels, compute_region_levels
+from nerg_mi.photos.salience import SalienceView
 from nerg_mi.ranges import KAPPAS, LENGTHS
-from nerg_mi.rays.folds import iter_folds, sample_participants_equally
-from nerg_mi.rays.rays import Rays
+from nerg_mi.tracking.filters import purge, split_by_person, split_by_position
+from nerg_mi.tracking.folds import iter_folds, sample_participants_equally
+from nerg_mi.tracking.probes import calibrate_levels, compute_region_levels
+from nerg_mi.tracking.rays import Rays
 
 from .gaze_data import (
     Supervision,
@@ -28,13 +30,167 @@ from .gaze_data import (
     compute_observer_bounds,
     find_hit_points,
     make_observer_targets,
-    make_prior_from_rays,
     make_rotated_directions,
     make_targets_from_rays,
-    select_prior_kappa,
 )
-from .gaze_settings import GazeSettings
-from .gaze_trainer import GazePlan, GazeProgress, GazeTrainer, ProgressCallback
+from .gaze_recipes import GazePlan
+from .gaze_settings import GazeSettings, ProbeSettings
+from .gaze_trainer import GazeProgress, GazeTrainer, ProgressCallback, scale_progress
+from .prior import make_prior_from_rays, select_prior_kappa
+
+# ---- Splits ----
+#
+# Positions and participants that are held out for testing, and positions that are held out for validation.
+
+_VALIDATION_FRACTION = 0.12  # Fraction of the views held out for validation
+
+
+@dataclass(frozen=True, eq=False)
+class ValidationSplit:
+    """Training and validation data of the first fit."""
+
+    training: Supervision  # Data to train on
+    validation: Supervision | None = None  # Data to validate on; None: no validation
+    # Positions (T, 3) of the validation probes in the frame of the rays; None: at the views
+    centres: np.ndarray | None = None
+    rays_held_out: int = 0  # Rays and views excluded from the training data
+    views_held_out: int = 0
+
+
+def split_validation(
+    supervision: Supervision, geometry: Environment, settings: GazeSettings, probes: ProbeSettings
+) -> ValidationSplit:
+    """Hold out zones of positions for validation, as many as ``settings.validation_zones``.
+
+    Training data within 2R of a validation position are removed, where R is the probe radius: rays and views, or only
+    views if there are no rays.
+
+    Raises `NergError` if too little training data would remain.
+    """
+    rays, views = supervision.rays, supervision.views
+    if not settings.validation_zones:
+        return ValidationSplit(supervision)
+    if rays is None:
+        train, validation = split_views(views, settings.validation_zones, 2 * probes.radius, settings.seed + 1)
+        return ValidationSplit(
+            Supervision(None, tuple(train)),
+            Supervision(None, tuple(validation)),
+            views_held_out=len(views) - len(train),
+        )
+    split = split_by_position(
+        rays,
+        probes.radius,
+        zones=settings.validation_zones,
+        test_probes=settings.validation_probes,
+        min_rays=settings.validation_min_rays or probes.min_rays,
+        seed=settings.seed + 1,
+    )
+    far_from_test = select_far_views(
+        views, geometry.points_to_field(split.test_centres), 2 * probes.radius * geometry.align.scale
+    )
+    return ValidationSplit(
+        Supervision(rays.select(split.train), tuple(far_from_test)),
+        # Validation uses all rays around the centres, because the truth is the gaze of everybody who was there.
+        Supervision(rays),
+        split.test_centres,
+        rays_held_out=int((~split.train).sum()),
+        views_held_out=len(views) - len(far_from_test),
+    )
+
+
+def hold_out(
+    rays: Rays,
+    radius: float,
+    zones: int,
+    positions: int,
+    seed: int = 0,
+    min_rays: int = 64,
+    participant_fraction: float = 0.0,
+) -> tuple[Rays, dict]:
+    """Hold out test positions, and optionally participants.
+
+    Parameters
+    ----------
+    rays : Rays
+        All gaze rays.
+    radius : float
+        Probe radius R in metres. Rays within 2R of a test position are removed (``rays.filters``), so that no training
+        probe comes within R of one.
+    zones, positions : int
+        Number of zones and total number of test positions.
+    seed : int
+        Seed of the split.
+    min_rays : int
+        Minimum number of rays around a test position.
+    participant_fraction : float
+        Fraction of the participants to hold out everywhere; the test positions are then chosen among theirs. 0 holds
+        out none.
+
+    Returns
+    -------
+    train : Rays
+        Rays to train on.
+    holdout : dict
+        Description of the split (JSON), with the test ``centres`` in the frame of the rays and the names of the
+        held-out participants (``people``).
+    """
+    is_training, names = np.ones(len(rays), bool), []
+    test_rays = rays
+    if participant_fraction:
+        is_training, is_held_out = split_by_person(rays, test_fraction=participant_fraction, seed=seed)
+        names = [rays.persons[i] for i in np.unique(rays.person[is_held_out])]
+        test_rays = rays.select(is_held_out)
+    split = split_by_position(test_rays, radius, zones=zones, test_probes=positions, min_rays=min_rays, seed=seed)
+    train = is_training & purge(rays, split.test_centres, 2 * radius)
+    holdout = {
+        "centres": split.test_centres.round(6).tolist(),
+        "zone": split.zone.tolist(),
+        "radius": radius,
+        "purged_within": 2 * radius,
+        "seed": seed,
+        "rays": len(rays),
+        "rays_to_train": int(train.sum()),
+        "rays_near_tests": int(split.test.sum()),
+        "people": names,
+    }
+    return rays.select(train), holdout
+
+
+def split_views(
+    views: Sequence[SalienceView], zones: int, distance: float, seed: int = 0
+) -> tuple[list[SalienceView], list[SalienceView]]:
+    """Split views into ``(training, validation)``.
+
+    An eighth of the views, in ``zones`` groups of neighbours, are held out for validation. Views within ``distance`` of
+    a validation view are excluded from training.
+
+    Raises `NergError` if too few views would remain.
+    """
+    centres = np.array([v.camera.center for v in views])
+    rng = np.random.default_rng(seed)
+    seeds = [int(rng.integers(len(views)))]
+    distances = np.full(len(views), np.inf)
+    while len(seeds) < min(zones, len(views)):
+        distances = np.minimum(distances, np.linalg.norm(centres - centres[seeds[-1]], axis=1))
+        seeds.append(int(rng.choice(np.argsort(-distances)[: max(1, len(views) // 4)])))
+    group_size = max(1, round(_VALIDATION_FRACTION * len(views) / len(seeds)))
+    seed_distances = np.linalg.norm(centres[:, None] - centres[seeds], axis=2)
+    validation = np.unique(np.argsort(seed_distances, axis=0, kind="stable")[:group_size])
+    train = select_far_views(views, centres[validation], distance)
+    if len(train) < max(2, len(views) // 4):
+        raise NergError(
+            f"only {len(train)} of {len(views)} views remain for training; the others are validation views or "
+            f"within {distance:g} of one; use fewer {parameter('validation_zones')} (0: no validation) or a "
+            f"smaller {parameter('radius')}"
+        )
+    return train, [views[k] for k in validation]
+
+
+def select_far_views(views: Sequence[SalienceView], points: np.ndarray, distance: float) -> list[SalienceView]:
+    """Return the ``views`` whose camera is farther than ``distance`` from each of ``points`` (T, 3), all in one
+    frame."""
+    return [v for v in views if np.linalg.norm(points - v.camera.center, axis=1).min(initial=np.inf) > distance]
+
 
 # ---- Selection of the prior ----
 #
@@ -89,13 +245,16 @@ class PriorSelection:
     folds: int  # Number of folds with enough participants and positions
     # Concentration of the prior's kernels; None if it was not selected.
     prior_kappa: float | None = None
-    # Mean log density of the held-out rays over that of the prior alone, in bits: with the selected weight, and of the
-    # field alone (with the smallest candidate weight).
+    # Mean log density of the held-out rays over that of the prior alone, in bits: with the weights that these rays
+    # selected, of the field alone (with the smallest candidate weight), and with the weights that the rays of the other
+    # folds select (None for a single fold).
     bits: float | None = None
     bits_field: float | None = None
-    # Nominal levels at which the regions hold `probes.probes.REGION_LEVELS` of the held-out gaze, by level name.
+    bits_crossed: float | None = None
+    # Nominal levels at which the regions hold `tracking.probes.REGION_LEVELS` of the held-out gaze, by level name.
     regions: dict[str, float] | None = None
-    # The variant selected by `select_variant`, and the bits of each variant with its own weight in the common folds.
+    # The variant selected by `select_variant`, and the bits of each variant with its own weight in the common folds,
+    # whose rays selected both.
     variant: str | None = None
     variants: dict[str, float] | None = None
     # Weight, bandwidth (metres) and concentration of the re-aimed hits; a weight of zero: none.
@@ -164,6 +323,16 @@ class FoldDensities(NamedTuple):
     make_hit_maps: Callable[[int], np.ndarray]
 
 
+class _Mixture(NamedTuple):
+    """Weights of the prior and of the re-aimed hits, the index of their kernel in `HIT_KERNELS`, and the gain (N,) over
+    the prior for each held-out participant."""
+
+    prior_weight: float
+    hits_weight: float
+    kernel: int | None
+    gains: np.ndarray
+
+
 @dataclass(frozen=True)
 class FoldResults:
     """Scores of one architecture in the folds."""
@@ -178,46 +347,55 @@ class FoldResults:
         """Select the weights of the prior and of the re-aimed hits; the default weight if there are no folds."""
         if not self.folds:
             return PriorSelection(self.default_weight, 0)
-        gains = self.compute_gains()
-        index = _select_weight(gains, self.caution)
-        selection = PriorSelection(float(PRIOR_WEIGHTS[index]), len(self.folds), self.kappa)
-        selected, kernel = gains[:, index], None
-        candidates, (prior_weights, hits_weights) = [], _WEIGHT_PAIRS.T
-        for k in range(self.folds[0].hits.shape[1]):
-            mixed = self._compute_gains(prior_weights, hits_weights, k)
-            index = _select_weight(mixed, self.caution)
-            candidates.append((mixed[:, index], _WEIGHT_PAIRS[index], k))
-        if candidates:
-            best, (weight, hits), k = max(candidates, key=lambda candidate: candidate[0].mean())
-            gain = best - selected
-            if gain.mean() > max(_MIN_HITS_GAIN, self.hits_caution * _standard_error(gain)):
-                selected, kernel, (bandwidth, kappa) = best, k, HIT_KERNELS[k]
-                selection = replace(
-                    selection,
-                    prior_weight=float(weight),
-                    hits_weight=float(hits),
-                    hits_bandwidth=bandwidth,
-                    hits_kappa=kappa,
-                )
+        plain = self.compute_gains()
+        pairs = _WEIGHT_PAIRS[:, 0], _WEIGHT_PAIRS[:, 1]
+        with_hits = [self.compute_gains(*pairs, k) for k in range(self.folds[0].hits.shape[1])]
+        best = self._select_mixture(plain, with_hits, np.ones(len(plain), bool))
         to_bits = lambda nats: float(nats.mean() / np.log(2))
-        regions = _calibrate_regions(self.folds, selection, kernel)
-        return replace(selection, bits=to_bits(selected), bits_field=to_bits(gains[:, 0]), regions=regions)
+        selection = PriorSelection(
+            best.prior_weight, len(self.folds), self.kappa, to_bits(best.gains), to_bits(plain[:, 0])
+        )
+        if best.kernel is not None:
+            bandwidth, kappa = HIT_KERNELS[best.kernel]
+            selection = replace(selection, hits_weight=best.hits_weight, hits_bandwidth=bandwidth, hits_kappa=kappa)
+        if len(self.folds) > 1:
+            fold = np.repeat(np.arange(len(self.folds)), [len(np.unique(fold.person)) for fold in self.folds])
+            crossed = [self._select_mixture(plain, with_hits, fold != k).gains[fold == k] for k in np.unique(fold)]
+            selection = replace(selection, bits_crossed=to_bits(np.concatenate(crossed)))
+        return replace(selection, regions=_calibrate_regions(self.folds, selection, best.kernel))
 
-    def compute_gains(self, folds: int | None = None) -> np.ndarray:
-        """Return the mean log density over that of the prior alone, in nats, of each held-out participant and with
-        each of `PRIOR_WEIGHTS` (N, S), in the first ``folds`` folds."""
-        return self._compute_gains(PRIOR_WEIGHTS, np.zeros_like(PRIOR_WEIGHTS), None, folds)
+    def _select_mixture(self, plain: np.ndarray, with_hits: Sequence[np.ndarray], mask: np.ndarray) -> _Mixture:
+        """Select the mixture that is best for the participants of ``mask`` (N,).
 
-    def compute_selected_gains(self, selection: PriorSelection, folds: int) -> np.ndarray:
-        """Return the same (N,) with the weights of ``selection``."""
-        h = selection.hits_weight
-        kernel = HIT_KERNELS.index((selection.hits_bandwidth, selection.hits_kappa)) if h else None
-        return self._compute_gains(np.array([selection.prior_weight]), np.array([h]), kernel, folds)[:, 0]
+        ``plain`` (N, W) are the gains of the candidates without re-aimed hits, ``with_hits`` those of `_WEIGHT_PAIRS`
+        for each of `HIT_KERNELS`.
+        """
+        index = _select_weight(plain[mask], self.caution)
+        best = _Mixture(float(PRIOR_WEIGHTS[index]), 0.0, None, plain[:, index])
+        candidates = []
+        for k, gains in enumerate(with_hits):
+            index = _select_weight(gains[mask], self.caution)
+            prior_weight, hits_weight = _WEIGHT_PAIRS[index].tolist()
+            candidates.append(_Mixture(prior_weight, hits_weight, k, gains[:, index]))
+        if candidates:
+            other = max(candidates, key=lambda mixture: mixture.gains[mask].mean())
+            gain = (other.gains - best.gains)[mask]
+            if gain.mean() > max(_MIN_HITS_GAIN, self.hits_caution * _standard_error(gain)):
+                return other
+        return best
 
-    def _compute_gains(
-        self, prior_weights: np.ndarray, hits_weights: np.ndarray, kernel: int | None, folds: int | None = None
+    def compute_gains(
+        self,
+        prior_weights: np.ndarray = PRIOR_WEIGHTS,
+        hits_weights: np.ndarray | float = 0.0,
+        kernel: int | None = None,
+        folds: int | None = None,
     ) -> np.ndarray:
-        """Return the same (N, W) with pairs of weights (W,), and the re-aimed hits of one of `HIT_KERNELS`."""
+        """Return the mean log density over that of the prior alone, in nats, of each held-out participant and with
+        each pair of weights (N, W), in the first ``folds`` folds.
+
+        ``kernel`` is the index of the re-aimed hits in `HIT_KERNELS`.
+        """
         gains = []
         for fold in self.folds[:folds]:
             hits = 0.0 if kernel is None else fold.hits[:, kernel, None]
@@ -225,6 +403,12 @@ class FoldResults:
             gain = _log(mixed) - _log(fold.prior)[:, None]
             gains += [gain[fold.person == p].mean(axis=0) for p in np.unique(fold.person)]
         return np.array(gains)
+
+    def compute_selected_gains(self, selection: PriorSelection, folds: int) -> np.ndarray:
+        """Return the same (N,) with the weights of ``selection``."""
+        weight, h = np.array([selection.prior_weight]), selection.hits_weight
+        kernel = HIT_KERNELS.index((selection.hits_bandwidth, selection.hits_kappa)) if h else None
+        return self.compute_gains(weight, h, kernel, folds)[:, 0]
 
 
 def _mix(field: Any, prior: Any, hits: Any, prior_weight: Any, hits_weight: Any) -> np.ndarray:
@@ -297,8 +481,11 @@ def evaluate_folds(
         test = sample_participants_equally(held_out, _MAX_RAYS, settings.seed + 3)
         assert targets.prior_table is not None  # The field has a prior
         folds.append(_evaluate_fold(trainer, targets.prior_table, train, test, geometry, plan, needs))
-        if len(folds) == _MIN_FOLDS and _has_enough_participants(folds, settings) and all(map(_needs_no_prior, folds)):
-            break
+        if len(folds) == _MIN_FOLDS and all(map(_needs_no_prior, folds)):
+            # To select the re-aimed hits, enough participants must be held out.
+            num_participants = sum(len(np.unique(fold.person)) for fold in folds)
+            if not settings.reaimed_hits or num_participants >= _MIN_PARTICIPANTS:
+                break
     on_progress(GazeProgress("folds", 1.0, settings.steps or 0, 0.0, None))
     cautions = (_CAUTION_WITHOUT_SURFACES,) * 2 if geometry.medium is None else ()
     return FoldResults(config.mix, None if config.prior_factor else kappa, folds, *cautions)
@@ -363,11 +550,6 @@ def _evaluate_hit_kernels(
             neighbours[bandwidth] = hits.find(positions, nearest)
         columns.append(np.array(hits.make_kde(neighbours[bandwidth], ns).density(probe, d), np.float64))
     return np.stack(columns, axis=1), nearest
-
-
-def _has_enough_participants(folds: Sequence[FoldDensities], settings: GazeSettings) -> bool:
-    """Return whether the ``folds`` hold out enough participants to select the re-aimed hits, if they are used."""
-    return not settings.reaimed_hits or sum(len(np.unique(fold.person)) for fold in folds) >= _MIN_PARTICIPANTS
 
 
 def _needs_no_prior(fold: FoldDensities) -> bool:
@@ -513,41 +695,8 @@ def _select_best(
     return replace(plan, config=configs[k]), replace(selections[k], variant=configs[k].variant, variants=variants)
 
 
-class StagedProgress:
-    """Reports the stages of a run as fractions of the whole, which never fall.
-
-    A stage covers a part of the fraction that is left, in proportion to its cost and to those of the later stages. So a
-    stage that ends early leaves more to the others.
-    """
-
-    def __init__(self, on_progress: ProgressCallback):
-        self._on_progress, self._fraction = on_progress, 0.0
-
-    def start(self, cost: float, *later: float) -> ProgressCallback:
-        """Return the callback of a stage of this ``cost`` that is followed by stages of the costs ``later``."""
-        begin = self._fraction
-        length = (1 - begin) * cost / max(cost + sum(later), 1e-9)
-
-        def report(progress: GazeProgress) -> None:
-            self._fraction = max(self._fraction, begin + length * progress.fraction)
-            self._on_progress(replace(progress, fraction=self._fraction))
-
-        return report
-
-
 def compute_fold_cost(plan: GazePlan) -> float:
     """Return the cost of all folds of all architectures of ``plan``, relative to a fit."""
     if plan.settings.minutes is not None:
         return FOLD_TIME_FRACTION / (1 - FOLD_TIME_FRACTION)
     return plan.settings.prior_folds * (1 + len(plan.alternatives))
-
-
-def scale_progress(on_progress: ProgressCallback, k: int, count: int, stage: str) -> ProgressCallback:
-    """Return a callback that reports part ``k`` of ``count`` as progress of the whole; ``stage`` formats the stage
-    names.
-    """
-
-    def report(progress: GazeProgress) -> None:
-        on_progress(replace(progress, stage=stage.format(progress.stage), fraction=(k + progress.fraction) / count))
-
-    return report

@@ -1,8 +1,7 @@
-"""Training of the log-density gaze field: its forward pass, its likelihood, its recipe, and the elevation prior."""
+"""Training of the log-density gaze field: its forward pass, its likelihood, and its recipe."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from types import ModuleType
 from typing import Any
@@ -11,20 +10,15 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.fields.encoding import HashGrid, HashGridConfig
-from nerg_mi.fields.gaze_base import make_prior_table, table_directions
 from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
 from nerg_mi.fields.gaze_product import softplus
-from nerg_mi.fields.mlp import MLP
-from nerg_mi.maths.geometry import AnyBox, Box
-from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.maths.vmf import log_normaliser
-from nerg_mi.probes.probes import compute_participant_weights
-from nerg_mi.rays.rays import Rays
+from nerg_mi.fields.mlp import MLP, stack
+from nerg_mi.maths.geometry import AnyBox
 
 from .gaze_data import GazeBatch, GazeTargets, compute_observer_bounds
 from .gaze_recipes import DEFAULT_RECIPE, FieldOptions, Recipe, register_recipe
+from .gaze_settings import GazeSettings, ProbeSettings
 from .gaze_trainer import GazeTrainer
-from .radiance_losses import stack
 
 # ---- Forward pass with the networks as tensor products, which trains fastest ----
 
@@ -97,14 +91,6 @@ def _broadcast(rows: list, like: Any) -> list:
     return [r + dr.zeros(type(r), dr.width(like)) if dr.width(r) == 1 else r for r in rows]
 
 
-def select_trainable_parameters(config: LogGazeConfig, parameters: dict) -> dict:
-    """Select the trainable ``parameters``: all but the position-independent prior and what the variant does not use."""
-    unused = {"emit": ("capture_net",), "capture": ("emit_net", "grid", "escaped")}.get(config.variant, ())
-    if config.escaped == "nearest":
-        unused += ("escaped",)
-    return {k: v for k, v in parameters.items() if k != "prior" and not k.startswith(unused or ("-",))}
-
-
 # ---- Likelihood ----
 #
 # Maximum-likelihood training of a normalised gaze field: a softmax over the sphere of each observer.
@@ -131,24 +117,33 @@ class LikelihoodTrainer(GazeTrainer):
         return LogGazeField.random(self.config, self.box, self.ns, self.settings.seed, self._prior_table)
 
     def select_trainable(self, parameters: dict) -> dict:
-        return select_trainable_parameters(self.config, parameters)
+        """Select the trainable ``parameters``: all but the position-independent prior and what the variant does not
+        use."""
+        unused = {"emit": ("capture_net",), "capture": ("emit_net", "grid", "escaped")}.get(self.config.variant, ())
+        if self.config.escaped == "nearest":
+            unused += ("escaped",)
+        return {k: v for k, v in parameters.items() if k != "prior" and not k.startswith(unused or ("-",))}
 
-    def backward(self) -> None:
-        s, data, ns = self.settings, self.data, self.ns
+    def draw_batch(self) -> GazeBatch:
+        """Draw uniform directions, followed by rays of the true density."""
+        s, data = self.settings, self.data
         observers = self.rng.choice(data.num_observers, min(s.probes, data.num_observers), replace=False)
         D = min(s.directions, data.num_directions)
         uniform = np.argpartition(self.rng.random((len(observers), data.num_directions)), D - 1, axis=1)[:, :D]
         cumulative = self._cumulative[observers]
         drawn = self.rng.random((len(observers), s.rays)) * cumulative[:, -1:]
         rays = np.stack([np.searchsorted(row, u) for row, u in zip(cumulative, drawn)])
-        batch = data.gather_batch(observers, np.concatenate([uniform, rays], axis=1))
+        return data.gather_batch(observers, np.concatenate([uniform, rays], axis=1))
+
+    def compute_loss(self, batch: GazeBatch) -> Any:
         logit = self._evaluate_logit(batch, self.current_parameters())
         # Split each probe's directions into the uniform ones and the rays.
-        run, lane = D + s.rays, lambda n: dr.arange(ns.UInt32, len(observers) * n)
+        ns, count, rays = self.ns, dr.width(batch.p_o), self.settings.rays
+        run = dr.width(batch.r_o) // count
+        D, lane = run - rays, lambda n: dr.arange(ns.UInt32, count * n)
         part = lambda n, first: dr.gather(ns.Float, logit, lane(n) // n * run + lane(n) % n + first)
-        likelihood = dr.block_sum(part(s.rays, D), s.rays) / s.rays
-        self.loss = dr.mean(log_mean_exp(part(D, 0), D) - likelihood + dr.log(batch.solid_angle))
-        dr.backward(self.loss)
+        likelihood = dr.block_sum(part(rays, D), rays) / rays
+        return dr.mean(log_mean_exp(part(D, 0), D) - likelihood + dr.log(batch.solid_angle))
 
     def _evaluate_logit(self, batch: GazeBatch, parameters: dict) -> Any:
         return evaluate_log_density(
@@ -156,10 +151,7 @@ class LikelihoodTrainer(GazeTrainer):
         )
 
     def evaluate_density(self, batch: GazeBatch, parameters: dict) -> Any:
-        return self._normalise(batch, self._evaluate_logit(batch, parameters))
-
-    @staticmethod
-    def _normalise(batch: GazeBatch, logit: Any) -> Any:
+        logit = self._evaluate_logit(batch, parameters)
         D = dr.width(logit) // dr.width(batch.solid_angle)
         return dr.exp(logit - dr.repeat(log_mean_exp(logit, D) + dr.log(batch.solid_angle), D))
 
@@ -171,70 +163,6 @@ def log_mean_exp(logit: Any, count: int) -> Any:
     """Return the log of the mean of exp over each run of ``count`` values, without overflow."""
     top = dr.detach(dr.block_reduce(dr.ReduceOp.Max, logit, count))
     return dr.log(dr.block_sum(dr.exp(logit - dr.repeat(top, count)), count) / count) + top
-
-
-# ---- Elevation prior ----
-#
-# A gaze field for an environment without recordings: the distribution of the gaze elevation in other environments.
-#
-# Among the candidates tried, only the elevation transfers between environments (docs/gaze-evaluation.md): laws of
-# distance or incidence fitted in other environments predict gaze worse.
-
-ELEVATION_KAPPA = 30.0  # Concentration of the kernel of a ray
-ELEVATION_PRIOR = "prior"  # Recipe in the provenance of such a field
-# Bins of the sine of the elevation, and directions of the quadrature that normalises the table.
-_NUM_BINS, _QUADRATURE_DIRECTIONS = 2048, 1 << 16
-
-
-def compute_elevation_density(
-    environments: Sequence[Rays], sine: np.ndarray, kappa: float = ELEVATION_KAPPA
-) -> np.ndarray:
-    """Estimate the gaze density as a function of the elevation only.
-
-    Parameters
-    ----------
-    environments : sequence of Rays
-        Gaze rays of each environment, z up. Environments have equal weight, and so have the participants of an
-        environment.
-    sine : numpy.ndarray
-        Sine of the elevation (N,) at which to evaluate.
-    kappa : float
-        Concentration of the von Mises-Fisher kernel of a ray.
-
-    Returns
-    -------
-    numpy.ndarray
-        Density (N,) in 1/sr.
-
-    Notes
-    -----
-    The mean over azimuths of a von Mises-Fisher density of concentration κ about a direction with sine t is C(κ) exp(κ
-    (s t - 1)) I₀(κ √(1 - s²) √(1 - t²)), with C of `maths.vmf`. `ive` is the exponentially scaled I₀.
-    """
-    from scipy.special import ive
-
-    histogram = np.zeros(_NUM_BINS)
-    for rays in environments:
-        weights = compute_participant_weights(rays) / len(rays) / len(environments)
-        histogram += np.histogram(rays.direction[:, 2], _NUM_BINS, (-1, 1), weights=weights)[0]
-    t, s = (np.arange(_NUM_BINS) + 0.5) * 2 / _NUM_BINS - 1, np.asarray(sine, np.float64)[:, None]
-    across = np.sqrt(np.maximum(1 - s**2, 0)) * np.sqrt(1 - t**2)
-    return np.exp(log_normaliser(kappa) + kappa * (s * t + across - 1)) * ive(0, kappa * across) @ histogram
-
-
-def make_elevation_prior(environments: Sequence[Rays], ns: ModuleType) -> LogGazeField:
-    """Make a gaze field that is the elevation density of ``environments`` at every observer position.
-
-    It can be used in any environment whose z axis points up, in any unit of length. ``ns`` is the Dr.Jit backend.
-    """
-    # The prior weight is 1: the networks exist but have no influence.
-    grid = HashGridConfig(levels=1, log2_rows=4, base=2, finest=2)
-    config = LogGazeConfig(grid=grid, variant="emit", width=8, layers=1, geometry="none", mix=1.0)
-    rows = config.prior
-    # Evaluate one texel per row; the density is the same in all columns.
-    density = np.repeat(compute_elevation_density(environments, table_directions(rows)[:: 2 * rows, 2]), 2 * rows)
-    table = make_prior_table(density, rows, ns, fibonacci_directions(_QUADRATURE_DIRECTIONS))
-    return LogGazeField.random(config, Box((-1.0,) * 3, (1.0,) * 3), ns, prior=table)
 
 
 # ---- Recipe ----
@@ -273,35 +201,29 @@ register_recipe(
         # No validation zones: a fit without the validation zones and their surroundings would lack most probes. Weight
         # decay and few harmonics prevent overfitting to the training participants: two or three times as many steps
         # give the same result.
-        settings={
-            "steps": 160,
-            "validation_zones": 0,
-            "loss": "likelihood",
-            "integral_weight": 0.0,
-            "probes": 24,
-            "directions": 512,
-            "rays": 64,
-            "learning_rate": 3e-3,
-            "lr_final_ratio": 0.1,
-            "lr_hold_fraction": 0.5,
-            "weight_decay": 1.0,
-            "ema_decay": 0.95,
-            "validation_min_rays": 64,
-            "prior_folds": 5,
-            "reaimed_hits": True,
-        },
+        settings=GazeSettings(
+            steps=160,
+            validation_zones=0,
+            loss="likelihood",
+            integral_weight=0.0,
+            probes=24,
+            directions=512,
+            rays=64,
+            learning_rate=3e-3,
+            lr_final_ratio=0.1,
+            lr_hold_fraction=0.5,
+            weight_decay=1.0,
+            ema_decay=0.95,
+            validation_min_rays=64,
+            prior_folds=5,
+            reaimed_hits=True,
+        ),
         # Probes are spaced evenly over the observer positions; a density proportional to the rays would follow where
         # people linger. Participants are weighted equally, because a long stay of one participant says little about
         # others.
-        probes={
-            "placement": "blue",
-            "spacing": 0.08,
-            "probes": 1024,
-            "min_rays": 1,
-            "kappa": 200.0,
-            "directions": 2048,
-            "ray_weights": "person",
-        },
+        probes=ProbeSettings(
+            placement="blue", spacing=0.08, probes=1024, min_rays=1, kappa=200.0, directions=2048, ray_weights="person"
+        ),
         views_only_settings={"steps": 200, "validation_zones": 3, "patience": 10},
         supported_options=frozenset({"prior_folds", "prior_kappa", "reaimed_hits"}),
     )

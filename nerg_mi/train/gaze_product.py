@@ -13,17 +13,16 @@ import numpy as np
 
 from nerg_mi.errors import NergError, parameter
 from nerg_mi.fields.encoding import HashGrid, HashGridConfig, encode_direction
-from nerg_mi.fields.gaze_product import GazeConfig, GazeField, activate
-from nerg_mi.fields.mlp import MLP
-from nerg_mi.fields.radiance import RadianceConfig, RadianceField
+from nerg_mi.fields.gaze_product import GazeConfig, ProductHead, activate
+from nerg_mi.fields.mlp import MLP, stack, unstack
+from nerg_mi.fields.radiance import RadianceConfig, RadianceNetwork
 from nerg_mi.maths.arrays import sigmoid
 from nerg_mi.maths.geometry import AnyBox
 
 from .gaze_data import GazeBatch
 from .gaze_recipes import DEFAULT_RECIPE, FieldOptions, Recipe, register_recipe
-from .gaze_settings import LOSSES
+from .gaze_settings import LOSSES, GazeSettings, ProbeSettings
 from .gaze_trainer import GazeTrainer, compute_gaze_loss
-from .radiance_losses import stack, unstack
 
 # ---- Product model ----
 #
@@ -42,7 +41,7 @@ def evaluate_gaze_density(
     ns: ModuleType,
     semantic: list | None = None,
 ) -> Any:
-    """Evaluate the gaze density; the same model as ``GazeField.evaluate``.
+    """Evaluate the gaze density; the same model as ``ProductHead.evaluate``.
 
     Parameters
     ----------
@@ -98,34 +97,30 @@ def evaluate_gaze_density(
     return gaze
 
 
-def select_trainable_parameters(config: GazeConfig, parameters: dict) -> dict:
-    """Select the ``parameters`` that the variant evaluates. The others would only decay."""
-    unused = {"emit": "capture_head", "capture": "emit_head"}.get(config.variant)
-    return {k: v for k, v in parameters.items() if unused is None or not k.startswith(unused)}
-
-
 # ---- Training of a product gaze field (equation 1) on the losses of the paper ----
 
 
 class ProductTrainer(GazeTrainer):
-    """Trains a ``GazeField``; see ``GazeTrainer``."""
+    """Trains a ``ProductHead``; see ``GazeTrainer``."""
 
     @classmethod
-    def init_from_radiance(cls, radiance: RadianceField, config: GazeConfig) -> tuple[GazeConfig, dict]:
+    def init_from_radiance(cls, radiance: RadianceNetwork, config: GazeConfig) -> tuple[GazeConfig, dict]:
         config = match_trunk_config(config, radiance.config)
         return config, extract_initial_weights(radiance, config)
 
     @classmethod
-    def configure_features(cls, radiance: RadianceField, config: GazeConfig) -> GazeConfig:
+    def configure_features(cls, radiance: RadianceNetwork, config: GazeConfig) -> GazeConfig:
         return replace(config, geometry=radiance.config.geometry)
 
-    def init_field(self) -> GazeField:
-        return GazeField.random(self.config, self.box, self.ns, self.settings.seed)
+    def init_field(self) -> ProductHead:
+        return ProductHead.random(self.config, self.box, self.ns, self.settings.seed)
 
     def select_trainable(self, parameters: dict) -> dict:
-        return select_trainable_parameters(self.config, parameters)
+        """Select the ``parameters`` that the variant evaluates. The others would only decay."""
+        unused = {"emit": "capture_head", "capture": "emit_head"}.get(self.config.variant)
+        return {k: v for k, v in parameters.items() if unused is None or not k.startswith(unused)}
 
-    def backward(self) -> None:
+    def draw_batch(self) -> GazeBatch:
         s, data = self.settings, self.data
         count, D = min(s.probes, data.num_observers), min(s.directions, data.num_directions)
         observers = self.rng.choice(data.num_observers, count, replace=False)
@@ -133,14 +128,16 @@ class ProductTrainer(GazeTrainer):
             directions = np.argpartition(self.rng.random((count, data.num_directions)), D, axis=1)[:, :D]
         else:
             directions = np.broadcast_to(np.arange(D), (count, D))
-        batch = data.gather_batch(observers, directions)
+        return data.gather_batch(observers, directions)
+
+    def compute_loss(self, batch: GazeBatch) -> Any:
+        s, D = self.settings, dr.width(batch.r_o) // dr.width(batch.p_o)
         density = self.evaluate_density(batch, self.current_parameters())
-        self.loss = compute_gaze_loss(density, batch.truth, D, **LOSSES[s.loss])
-        total = self.loss.total
+        total = compute_gaze_loss(density, batch.truth, D, **LOSSES[s.loss]).total
         if s.integral_weight:
             # Compare with the truth in the same directions, so that a subset of directions causes no bias.
             total += s.integral_weight * dr.mean(dr.square(batch.integrate(density - batch.truth)))
-        dr.backward(total)
+        return total
 
     def evaluate_density(self, batch: GazeBatch, parameters: dict) -> Any:
         semantic = batch.semantic if self.config.semantic else None
@@ -164,7 +161,7 @@ def match_trunk_config(config: GazeConfig, radiance: RadianceConfig) -> GazeConf
     )
 
 
-def extract_initial_weights(field: RadianceField, config: GazeConfig) -> dict:
+def extract_initial_weights(field: RadianceNetwork, config: GazeConfig) -> dict:
     """Return the grid and position network of ``field`` under the parameter names of a gaze field.
 
     Raises `NergError` if the sizes of ``config`` differ.
@@ -248,8 +245,8 @@ register_recipe(
         make_config=_make_product_config("small", "softplus"),
         trainer=ProductTrainer,
         losses=("paper", "code"),
-        settings={"steps": 600},
-        probes={},
+        settings=GazeSettings(steps=600),
+        probes=ProbeSettings(),
         supported_options=_PRODUCT_OPTIONS,
     )
 )
@@ -260,26 +257,21 @@ register_recipe(
         make_config=_make_product_config("paper", "linear"),
         trainer=ProductTrainer,
         losses=("paper", "code"),
-        settings={
-            "steps": 12_800,
-            "loss": "paper",
-            "integral_weight": 0.0,
-            "probes": 16,
-            "directions": 1024,
-            "learning_rate": 1e-3,
-            "lr_final_ratio": 0.1,
-            "lr_hold_fraction": 0.0,
-            "weight_decay": 0.0,
-        },
+        settings=GazeSettings(
+            steps=12_800,
+            loss="paper",
+            integral_weight=0.0,
+            probes=16,
+            directions=1024,
+            learning_rate=1e-3,
+            lr_final_ratio=0.1,
+            lr_hold_fraction=0.0,
+            weight_decay=0.0,
+        ),
         # Bandwidth and minimum number of rays are those of the authors' code.
-        probes={
-            "radius": 0.1,
-            "probes": 4096,
-            "max_rays": 1024,
-            "kappa_rule": "silverman",
-            "directions": 1024,
-            "min_rays": 8,
-        },
+        probes=ProbeSettings(
+            radius=0.1, probes=4096, max_rays=1024, kappa_rule="silverman", directions=1024, min_rays=8
+        ),
         supported_options=_PRODUCT_OPTIONS,
     )
 )

@@ -1,4 +1,4 @@
-"""Training recipes of gaze fields, by name.
+"""Training recipes of gaze fields, by name, and the plans that they make for an environment.
 
 A kind of field has a module ``gaze_KIND`` for its training, which registers recipes. `load_recipes` imports these
 modules.
@@ -8,16 +8,17 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
-from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 from nerg_mi.environment.environment import Environment
 from nerg_mi.errors import NergError, parameter
 from nerg_mi.fields.gaze_base import GazeHeadConfig, kinds
 
+from .gaze_data import Supervision
 from .gaze_settings import GazeSettings, ProbeSettings
-from .gaze_trainer import GazePlan, GazeTrainer
+from .gaze_trainer import GazeTrainer
 
 DEFAULT_RECIPE = "default"  # Recipe that is used if none is named
 
@@ -34,9 +35,42 @@ class FieldOptions:
     activation: str | None = None
     size: str | None = None  # Name of the network size; None: set by the recipe
     normalized: bool = False  # Whether the density is divided by its integral over the sphere
-    semantic: str = ""  # Radiance-field features as input of emit (`fields.gaze_product.SEMANTICS`); "": none
-    semantic_own: bool = False  # Whether emit also has the field's own features
+    # Input of emit: features that the density network of the environment's radiance field computes, "accumulated"
+    # (integrated along the ray from the observer) or "snapshot" (at the surface); "": none
+    semantic: str = ""
+    semantic_own: bool = False  # Whether emit also has the features of its own hash grid
+    init_from_field: bool = False  # Whether training begins with the weights of that radiance field's trunk
     geometry_kind: str = "field"  # Kind of the training geometry (`Environment.kind`)
+
+
+@dataclass(frozen=True, kw_only=True)
+class GazePlan:
+    """Architecture, settings and trainer of a training, without its data and geometry."""
+
+    config: GazeHeadConfig  # Architecture of the field
+    # Alternative architectures that folds may select (`gaze_folds.select_variant`).
+    alternatives: tuple[GazeHeadConfig, ...] = ()
+    settings: GazeSettings  # Optimisation settings
+    probes: ProbeSettings  # How rays become probes
+    trainer: type[GazeTrainer]  # Trainer class of this kind of field
+    # Initial arrays by name (`GazeTrainer.init_from_radiance`); None: random initialisation.
+    initial_arrays: dict[str, Any] | None = None
+
+    def with_settings(self, **changes: Any) -> GazePlan:
+        """Return the plan with changed ``settings``."""
+        return replace(self, settings=replace(self.settings, **changes))
+
+    def make_identity(self, supervision: Supervision, environment: Environment) -> dict:
+        """Return the data that must match for a run to be resumed (JSON)."""
+        align = environment.align
+        return {
+            **supervision.compute_digest(),
+            "settings": self.settings.to_dict(),
+            "probes": self.probes.to_dict(),
+            "architecture": self.config.to_dict(),
+            "box": environment.box.to_dict(),
+            "align": None if align.is_identity else align.matrix.tolist(),
+        }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,100 +84,112 @@ class Recipe:
     make_config: Callable[[FieldOptions], GazeHeadConfig]
     trainer: type[GazeTrainer]  # Trainer class of such a field
     losses: tuple[str, ...]  # Supported losses (`gaze_settings.LOSSES`)
-    settings: Mapping[str, Any]  # Keywords of `GazeSettings`, including the length of the training
-    probes: Mapping[str, Any]  # Keywords of `ProbeSettings`
+    settings: GazeSettings  # Settings of the optimisation, including the length of the training
+    probes: ProbeSettings  # Settings of the targets
+    options: FieldOptions = FieldOptions()  # Options of the architecture
     # Changes of ``settings`` for training on views only, whose common structure is learned late, after a plateau.
     views_only_settings: Mapping[str, Any] = field(default_factory=lambda: {"patience": 10})
     # Options that the recipe supports, among "activation", "size", "normalize", "semantic", "init", "loss",
     # "integral_weight", "prior_folds", "prior_kappa", "reaimed_hits".
     supported_options: frozenset[str] = frozenset()
 
-    def make_plan(
-        self,
-        geometry: Environment,
-        options: FieldOptions | None = None,
-        *,
-        settings: Mapping[str, Any] | None = None,
-        probes: Mapping[str, Any] | None = None,
-        init_from_field: bool = False,
-        views_only: bool = False,
-    ) -> GazePlan:
-        """Make the training plan of this recipe for a geometry.
+    def override(self, **settings: Any) -> Recipe:
+        """Return the recipe with other ``settings``: fields of `ProbeSettings` and `GazeSettings`.
+
+        None stands for the value of the recipe. If only one of minutes and steps is given, it replaces the other.
+        """
+        values = {name: value for name, value in settings.items() if value is not None}
+        if "minutes" in values:
+            values.setdefault("steps", None)
+        elif "steps" in values:
+            values["minutes"] = None
+        names = {f.name for f in fields(ProbeSettings)}
+        probes = {name: value for name, value in values.items() if name in names}
+        rest = {name: value for name, value in values.items() if name not in names}
+        return replace(self, probes=replace(self.probes, **probes), settings=replace(self.settings, **rest))
+
+    def without_rays(self) -> Recipe:
+        """Return the recipe for training on salience views only, which do not determine the integral of the density."""
+        normalized = self.options.normalized or "normalize" in self.supported_options
+        options = replace(self.options, normalized=normalized)
+        return replace(self, options=options, settings=replace(self.settings, **self.views_only_settings))
+
+    def make_plan(self, environment: Environment, variant: str = "") -> GazePlan:
+        """Make the training plan of this recipe for an environment.
 
         Parameters
         ----------
-        geometry : Environment
-            Training geometry.
-        options : FieldOptions, optional
-            Options of the field.
-        settings, probes : mapping, optional
-            Keywords of `GazeSettings` and `ProbeSettings` that override the recipe. If only one of minutes and steps is
-            given, it replaces the other.
-        init_from_field : bool
-            Initialise the trunk with the weights of the radiance field of the geometry.
-        views_only : bool
-            Train on salience views without rays.
+        environment : Environment
+            Geometry of the training.
+        variant : str
+            Factors of the density, as in `FieldOptions`.
 
         Raises
         ------
         NergError
-            If the field needs surfaces or a radiance field and the geometry has none.
+            If the field needs surfaces or a radiance field and the environment has none.
         """
-        options = replace(options or FieldOptions(), geometry_kind=geometry.kind)
-        (config, *alternatives), initial = self.list_architectures(options), None
-        if init_from_field or options.semantic:
-            option = parameter("init", "field") if init_from_field else parameter("semantic")
-            if geometry.radiance is None:
-                raise NergError(f"{option} needs a radiance field; pass one with {parameter('field')}")
-            if ("init" if init_from_field else "semantic") not in self.supported_options:
-                raise NergError(f"the recipe {self.name} does not support {option}; leave it out")
-            if init_from_field:
-                config, initial = self.trainer.init_from_radiance(geometry.radiance, config)
+        options = self.options
+        (config, *alternatives), initial = self.list_architectures(environment.kind, variant), None
+        if options.init_from_field or options.semantic:
+            what = "init_from_field" if options.init_from_field else "semantic"
+            if environment.radiance is None:
+                raise NergError(
+                    f"the option {what} of the recipe needs a radiance field; pass one as {parameter('environment')}"
+                )
+            if options.init_from_field:
+                config, initial = self.trainer.init_from_radiance(environment.radiance.network, config)
             else:
-                config = self.trainer.configure_features(geometry.radiance, config)
+                config = self.trainer.configure_features(environment.radiance.network, config)
         return GazePlan(
             config=config,
             alternatives=tuple(alternatives),
-            settings=self.make_gaze_settings(settings, views_only),
-            probes=self.make_probe_settings(probes),
+            settings=self.settings,
+            probes=self.probes,
             trainer=self.trainer,
             initial_arrays=initial,
         )
 
-    def list_architectures(self, options: FieldOptions) -> tuple[GazeHeadConfig, ...]:
-        """Return the architectures for ``options``: one if a variant is given, otherwise one for each of
-        `get_default_variants`.
+    def list_architectures(self, kind: str, variant: str = "") -> tuple[GazeHeadConfig, ...]:
+        """Return the architectures for an environment of this ``kind``: one if a ``variant`` is given, otherwise one
+        for each of `get_default_variants`.
 
         The first is used unless folds select another. Raises as ``make_config`` does.
         """
-        variants = (options.variant,) if options.variant else get_default_variants(options.geometry_kind)
+        options = replace(self.options, geometry_kind=kind)
+        variants = (variant or options.variant,) if variant or options.variant else get_default_variants(kind)
         return tuple(self.make_config(replace(options, variant=variant)) for variant in variants)
 
-    def make_gaze_settings(self, overrides: Mapping[str, Any] | None = None, views_only: bool = False) -> GazeSettings:
-        """Return the settings of the recipe with ``overrides``; see `make_plan`."""
-        overrides = overrides or {}
-        values = {**self.settings, **(self.views_only_settings if views_only else {}), **overrides}
-        if overrides.get("minutes") is not None and overrides.get("steps") is None:
-            values["steps"] = None
-        return GazeSettings(**values)
-
-    def make_probe_settings(self, overrides: Mapping[str, Any] | None = None) -> ProbeSettings:
-        """Return the probe settings of the recipe with ``overrides``."""
-        return ProbeSettings(**{**self.probes, **(overrides or {})})
-
-    def check_options(self, names: Collection[str]) -> None:
-        """Raise `NergError` unless the recipe supports all options with these ``names``."""
+    def check(self) -> None:
+        """Raise `NergError` for options and settings that the recipe does not support."""
+        options, settings = self.options, self.settings
+        chosen = {
+            "activation": options.activation,
+            "size": options.size,
+            "semantic": options.semantic,
+            "init": options.init_from_field,
+            "normalize": options.normalized,
+            "loss": settings.loss not in self.losses,
+            "integral_weight": settings.integral_weight not in (0, GazeSettings.integral_weight),
+            "prior_folds": settings.prior_folds,
+            "prior_kappa": self.probes.prior_kappa is not None,
+            "reaimed_hits": settings.reaimed_hits,
+        }
+        names = [name for name, is_set in chosen.items() if is_set]
+        if "loss" in names and "loss" in self.supported_options:
+            raise NergError(f'the loss must be one of {", ".join(self.losses)}, got "{settings.loss}"')
+        if settings.freeze and not options.init_from_field:
+            raise NergError("the setting freeze of the recipe needs its option init_from_field; set both or none")
         unsupported = [name for name in names if name not in self.supported_options]
         if not unsupported:
             return
-        spelling = ", ".join(parameter(n, "field" if n == "init" else "") for n in unsupported)
-        alternatives = [r.name for r in load_recipes().values() if r.supported_options.issuperset(names)]
+        alternatives = [r.name for r in load_recipes().values() if r.supported_options.issuperset(unsupported)]
         remedy = (
-            f"add {parameter('recipe', alternatives[0])}"
+            f"use {parameter('recipe', alternatives[0])}"
             if alternatives
             else f"leave {'it' if len(unsupported) == 1 else 'them'} out"
         )
-        raise NergError(f"the recipe {self.name} does not support {spelling}; {remedy}")
+        raise NergError(f"the recipe {self.name} does not support {', '.join(map(parameter, unsupported))}; {remedy}")
 
 
 def get_default_variants(geometry_kind: str) -> tuple[str, ...]:
@@ -165,7 +211,7 @@ def register_recipe(recipe: Recipe) -> Recipe:
     >>> from dataclasses import replace
     >>> from nerg_mi.train.gaze_recipes import RECIPES, get_recipe
     >>> usual = get_recipe("default")
-    >>> longer = replace(usual, name="longer", settings={**usual.settings, "steps": 5000})
+    >>> longer = replace(usual, name="longer", settings=replace(usual.settings, steps=5000))
     >>> nerg.register_recipe(longer).name  # for train_gaze(..., recipe="longer")
     'longer'
     >>> del RECIPES["longer"]
@@ -176,8 +222,10 @@ def register_recipe(recipe: Recipe) -> Recipe:
     return recipe
 
 
-def get_recipe(name: str = DEFAULT_RECIPE) -> Recipe:
-    """Return the recipe with this ``name``. Raises `NergError` if there is none."""
+def get_recipe(name: str | Recipe = DEFAULT_RECIPE) -> Recipe:
+    """Return the recipe with this ``name``, or ``name`` if it is a recipe. Raises `NergError` if there is none."""
+    if isinstance(name, Recipe):
+        return name
     available = load_recipes()
     if name not in available:
         raise NergError(f'the recipe must be one of {", ".join(available)}, got "{name}"')

@@ -18,7 +18,6 @@ from nerg_mi.ranges import (
     Range,
     ValidatedDataclass,
     range_field,
-    setting,
 )
 
 from .radiance_settings import RunSettings
@@ -42,39 +41,27 @@ LOSSES = {"paper": PAPER, "code": CODE, "likelihood": {"kld": 1.0, "cc": 0.0, "m
 class ProbeSettings(ValidatedDataclass):
     """How rays become probes and probes become targets. Lengths are in metres, in the frame of the rays."""
 
-    radius: float = setting(0.25, "Radius R of a probe in metres.", allowed=LENGTHS)
-    probes: int = setting(2048, "Maximum number of probes.", allowed=Range(1, 10**6))
-    max_rays: int = setting(1024, "Maximum number of rays in a probe; the nearest are used.", allowed=Range(1, 10**6))
-    min_rays: int = setting(64, "Minimum number of rays in a probe.", allowed=Range(1, 10**6))
-    kappa_rule: str = setting(
-        "fixed",
-        "How the concentration of a ray's kernel is chosen: fixed (by kappa), silverman (rule of thumb) or loo "
-        "(leave-one-out likelihood).",
-    )
-    kappa: float = setting(
-        50.0,
-        "Concentration of the von Mises-Fisher kernel (unitless), or its standard deviation such as 4deg, for the rule "
-        "fixed.",
-        allowed=KAPPAS,
-    )
+    # The fields that are no keywords of `nerg_mi.train.gaze.train_gaze` are set by a recipe.
+    radius: float = range_field(0.25, LENGTHS)
+    probes: int = range_field(2048, Range(1, 10**6))
+    max_rays: int = range_field(1024, Range(1, 10**6))  # Maximum number of rays in a probe; the nearest are used
+    min_rays: int = range_field(64, Range(1, 10**6))
+    # How the concentration of a ray's kernel is chosen: fixed (by kappa), silverman (rule of thumb) or loo
+    # (leave-one-out likelihood).
+    kappa_rule: str = "fixed"
+    # Concentration of the von Mises-Fisher kernel (unitless) for the rule fixed
+    kappa: float = range_field(50.0, KAPPAS)
     # Directions of equal area, randomly rotated and fixed, so that depths are traced once.
-    directions: int = setting(
-        1024, "Number of directions of a probe at which its density is evaluated.", allowed=DIRECTIONS
-    )
+    directions: int = range_field(1024, DIRECTIONS)
     depth: str = "median"  # Depth estimator (`transport.depth`)
-    placement: str = setting("data", "Placement of probes: data (at ray origins), grid, random, or blue (blue noise).")
+    placement: str = "data"  # Placement of probes: data (at ray origins), grid, random, or blue (blue noise)
     spacing: float | None = range_field(None, LENGTHS)  # Distance between probes, for placements that use it
-    resample_directions: bool = setting(False, "Draw new directions for each epoch, not once per probe.")
-    ray_weights: str = setting(
-        "equal", "Weights of the rays in a probe: equal, distance (1 - d/R), or person (equal for each participant)."
-    )
-    prior_kappa: float | None = setting(
-        None,
-        "Only for the recipe named default: concentration (unitless), or standard deviation such as 10deg, of the "
-        "kernels of the position-independent prior. Default: chosen by leaving out participants, or 30 without "
-        "--prior-folds.",
-        allowed=KAPPAS,
-    )
+    resample_directions: bool = False  # Draw new directions for each epoch, not once per probe
+    # Weights of the rays in a probe: equal, distance (1 - d/R), or person (equal for each participant)
+    ray_weights: str = "equal"
+    # Concentration of the kernels of the position-independent prior of the default recipe. None: chosen by leaving out
+    # participants, or 30 without ``prior_folds``.
+    prior_kappa: float | None = range_field(None, KAPPAS)
 
     def to_dict(self) -> dict:
         """Return the settings as JSON, for the provenance."""
@@ -85,57 +72,38 @@ class ProbeSettings(ValidatedDataclass):
 class GazeSettings(RunSettings):
     """Settings of the optimisation and the validation. Exactly one of ``steps`` and ``minutes`` is set."""
 
-    steps: int | None = setting(None, "Number of training steps.", allowed=STEPS)
-    minutes: float | None = setting(
-        None, "Training time in minutes, in place of --steps; includes the second fit.", allowed=MINUTES
-    )
-    seed: int = setting(0, "Seed of probes, directions, weights, batches and splits.", allowed=SEEDS)
-    # "likelihood" is the loss of the log density.
-    loss: str = setting(
-        "paper",
-        "Only for the recipes small and paper: loss; paper is KLD + (1 - CC) + MAE, code is MAE + 0.1 (1 - CC).",
-    )
-    # KLD and CC do not depend on the integral. MAE alone pulls it to the median.
-    integral_weight: float = setting(
-        1.0,
-        "Only for the recipes small and paper: weight of the squared error of the integral over the sphere.",
-        allowed=LOSS_WEIGHTS,
-    )
+    steps: int | None = range_field(None, STEPS)
+    minutes: float | None = range_field(None, MINUTES)
+    seed: int = range_field(0, SEEDS)
+    # Loss of the recipes small and paper: paper is KLD + (1 - CC) + MAE, code is MAE + 0.1 (1 - CC). "likelihood" is
+    # the loss of the log density.
+    loss: str = "paper"
+    # Weight of the squared error of the integral over the sphere, for the recipes small and paper: KLD and CC do not
+    # depend on the integral, and MAE alone pulls it to the median.
+    integral_weight: float = range_field(1.0, LOSS_WEIGHTS)
     probes: int = range_field(16, Range(1, 10**6))  # Random probes per step
     directions: int = range_field(256, Range(1, 1 << 20))  # Random directions per probe
     rays: int = range_field(64, Range(1, 10**6))  # Rays per probe, drawn from its density, for the likelihood
-    learning_rate: float = setting(1e-2, "Initial learning rate.", allowed=LEARNING_RATES)
+    learning_rate: float = range_field(1e-2, LEARNING_RATES)  # Initial learning rate
     # Final learning rate as a fraction of the initial one; the decay is exponential.
     lr_final_ratio: float = range_field(0.03, Range(0, 1))
     # Fraction of the run with constant learning rate, before it decays
     lr_hold_fraction: float = range_field(0.3, Range(0, 0.999))
-    # AdamW: fraction of the weights per step and unit of learning rate.
-    weight_decay: float = setting(0.3, "Decoupled weight decay (AdamW).", allowed=WEIGHT_DECAYS)
+    # Decoupled weight decay (AdamW): fraction of the weights per step and unit of learning rate
+    weight_decay: float = range_field(0.3, WEIGHT_DECAYS)
     # Decay per step of the exponential moving average of the weights, which is the result
     ema_decay: float = range_field(0.98, Range(0, 1))
     num_validations: int = range_field(20, Range(1, 10**6))  # Number of validations per run
     # Validations without an improvement after which the run stops; 0 disables early stopping.
     patience: int = range_field(6, Range(0, 10**6))
-    validation_zones: int = setting(
-        3, "Number of position zones held out for validation (early stopping); 0 disables it.", allowed=Range(0, 1000)
-    )
+    validation_zones: int = range_field(3, Range(0, 1000))
     validation_probes: int = range_field(60, Range(1, 10**6))  # Validation probes in all zones
     # Minimum rays per validation probe; None: as for training probes.
     validation_min_rays: int | None = range_field(None, Range(1, 10**6))
-    refit: bool = setting(True, "Train again on all rays, for the number of steps that validation found best.")
-    prior_folds: int = setting(
-        0,
-        "Only for the recipe named default: number of cross-validation folds over participants and positions that "
-        "choose the weight of the position-independent prior; 0: no folds, the weight is 0.05.",
-        allowed=Range(0, 1000),
-    )
-    reaimed_hits: bool = setting(
-        False,
-        "Only for the recipe named default: mix a kernel density of the samples' hit points, seen from the observer, "
-        "into the field, with a weight chosen by --prior-folds. The file then contains up to 32,768 samples without "
-        "names and times.",
-    )
-    freeze: bool = setting(False, "Keep the weights of --init field fixed.")
+    refit: bool = True  # Train again on all rays, for the number of steps that validation found best
+    prior_folds: int = range_field(0, Range(0, 1000))
+    reaimed_hits: bool = False
+    freeze: bool = False  # Keep the weights that come from the radiance field fixed
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -1,12 +1,10 @@
-"""Gaze training loop: losses, trainer base class, run state and fits."""
+"""Gaze training step: losses, the base class of trainers, and progress of a run."""
 
 from __future__ import annotations
 
-import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -14,18 +12,14 @@ import drjit as dr
 import numpy as np
 from drjit.opt import AdamW
 
-from nerg_mi.environment.environment import Environment
-from nerg_mi.errors import NergError, parameter, sanitize
-from nerg_mi.fields.gaze_base import GazeHead, GazeHeadConfig
-from nerg_mi.fields.radiance import RadianceField
-from nerg_mi.files.schema import INDEX, Items, check_json
-from nerg_mi.formats.checkpoint import read_checkpoint, write_checkpoint
-from nerg_mi.interruption import Interruption
+from nerg_mi.errors import NergError, parameter
+from nerg_mi.fields.gaze_base import GazeHead
+from nerg_mi.fields.radiance import RadianceNetwork
 from nerg_mi.maths.geometry import AnyBox
 
-from .gaze_data import GazeBatch, GazeTargets, Supervision, TargetArrays
-from .gaze_settings import MIN_MEAN_DENSITY, GazeSettings, ProbeSettings
-from .trainer import Trainer, check_same_run, check_shape, read_count, reading_run_state
+from .gaze_data import GazeBatch, GazeTargets, TargetArrays
+from .gaze_settings import MIN_MEAN_DENSITY, GazeSettings
+from .trainer import Trainer
 
 # ---- Losses between predicted and true gaze densities of probes, in Dr.Jit ----
 #
@@ -84,8 +78,13 @@ def compute_gaze_loss(
     """
     if not (kld or cc or mae):
         raise ValueError("all weights of the gaze loss are zero; set kld, cc or mae")
-    n = _check_lengths(prediction, truth, directions)
-    w = _normalise_weights(type(truth), directions, n, solid_angle)
+    n = dr.width(truth)
+    if dr.width(prediction) != n or directions < 1 or n % directions:
+        raise ValueError(
+            f"{dr.width(prediction)} predictions, {n} true densities and {directions} directions per probe do not "
+            "match: both must be flat arrays with all directions of each probe in turn"
+        )
+    w = _normalise_solid_angles(type(truth), directions, n, solid_angle)
     truth = dr.detach(truth)
 
     parts: dict[str, Any] = {"kld": None, "cc": None, "mae": None}
@@ -142,17 +141,7 @@ def _center(values: Any, directions: int, w: Any) -> tuple[Any, Any]:
     return centred, dr.select(variance > dr.square(MIN_RELATIVE_SPREAD * dr.detach(mean)), variance, 0)
 
 
-def _check_lengths(prediction: Any, truth: Any, directions: int) -> int:
-    n = dr.width(truth)
-    if dr.width(prediction) != n or directions < 1 or n % directions:
-        raise ValueError(
-            f"{dr.width(prediction)} predictions, {n} true densities and {directions} directions per probe do not "
-            "match: both must be flat arrays with all directions of each probe in turn"
-        )
-    return n
-
-
-def _normalise_weights(Float: type, directions: int, n: int, solid_angle: Any) -> Any:
+def _normalise_solid_angles(Float: type, directions: int, n: int, solid_angle: Any) -> Any:
     if solid_angle is None:
         return Float(1.0 / directions)
     w = Float(solid_angle)
@@ -228,12 +217,11 @@ class GazeTrainer(Trainer, ABC):
         parameters, frozen = self.initial_field.parameters(), (initial or {}) if settings.freeze else {}
         trained = {k: v for k, v in self.select_trainable(parameters).items() if k not in frozen}
         self.constant = {k: v for k, v in parameters.items() if k not in trained}
-        self.loss: Any = None
         decay = settings.weight_decay
         self.start(AdamW(settings.learning_rate, trained, beta_2=0.99, epsilon=1e-15, weight_decay=decay))
 
     @classmethod
-    def init_from_radiance(cls, radiance: RadianceField, config: Any) -> tuple[Any, dict]:
+    def init_from_radiance(cls, radiance: RadianceNetwork, config: Any) -> tuple[Any, dict]:
         """Return ``config`` with the sizes of a radiance field, and the arrays of the field to start from."""
         raise NergError(
             f"a {config.kind} gaze field cannot be initialised from a radiance field; leave out "
@@ -241,7 +229,7 @@ class GazeTrainer(Trainer, ABC):
         )
 
     @classmethod
-    def configure_features(cls, radiance: RadianceField, config: Any) -> Any:
+    def configure_features(cls, radiance: RadianceNetwork, config: Any) -> Any:
         """Return ``config`` with the number of semantic features of ``radiance``."""
         raise NergError(f"a {config.kind} gaze field has no semantic features; leave out {parameter('semantic')}")
 
@@ -258,8 +246,12 @@ class GazeTrainer(Trainer, ABC):
         return {k: v for k, v in parameters.items() if k not in self.initial_field.fixed}
 
     @abstractmethod
-    def backward(self) -> None:
-        """Draw a batch and accumulate the gradients of its loss in the weights."""
+    def draw_batch(self) -> GazeBatch:
+        """Draw the observers and directions of a step."""
+
+    @abstractmethod
+    def compute_loss(self, batch: GazeBatch) -> Any:
+        """Compute the loss (Float, one lane) of ``batch`` with the current weights."""
 
     @abstractmethod
     def evaluate_density(self, batch: GazeBatch, parameters: dict) -> Any:
@@ -286,8 +278,9 @@ class GazeTrainer(Trainer, ABC):
             epoch = self.steps * min(self.settings.probes, self.data.num_observers) // self.data.num_observers
             if epoch != self._epoch:
                 self.set_targets(self._targets.resample(epoch), epoch)
-        self.backward()
-        self.move_weights()
+        dr.backward(self.compute_loss(self.draw_batch()))
+        self.optimiser.set_learning_rate(self.settings.learning_rate_at(self.progress))
+        self.optimiser.step()
         self.steps += 1
         self.average_weights()
         # Synchronise, because kernels are only queued: otherwise a run with a time limit would count no time and
@@ -299,7 +292,12 @@ class GazeTrainer(Trainer, ABC):
         rows = []
         with dr.suspend_grad():
             for batch in self.iter_batches(targets):
-                density = self._mix_prior(batch, {**self.constant, **(weights or self.averaged)})
+                density = self.evaluate_density(batch, {**self.constant, **(weights or self.averaged)})
+                if mix := self.config.mix:
+                    # The prior weight applies on the sphere. For a view it is applied within the view, because the
+                    # field's integral outside is unknown.
+                    prior = batch.condition_on_view(dr.exp(self.initial_field.log_prior(batch.r_o)))
+                    density = (1 - mix) * density + mix * prior
                 parts = compute_gaze_loss(density, batch.truth, targets.truth.shape[1])
                 integral = batch.integrate(density)
                 means = parts.kld, parts.cc, parts.mae, dr.mean(integral), dr.mean(dr.square(1 - integral))
@@ -307,16 +305,6 @@ class GazeTrainer(Trainer, ABC):
         rows = np.array(rows)
         kld, cc, mae, integral, off = rows[:, 0] @ rows[:, 1:] / rows[:, 0].sum()
         return Scores(self.validation_objective(kld, cc, mae, off), kld, cc, mae, integral)
-
-    def _mix_prior(self, batch: GazeBatch, parameters: dict) -> Any:
-        density, mix = self.evaluate_density(batch, parameters), self.config.mix
-        if mix:
-            # The prior weight applies on the sphere. For a view it is applied within the view, because the field's
-            # integral outside is unknown.
-            density = (1 - mix) * density + mix * batch.condition_on_view(
-                dr.exp(self.initial_field.log_prior(batch.r_o))
-            )
-        return density
 
     def evaluate_densities(self, targets: GazeTargets) -> np.ndarray:
         """Evaluate the field, without the mixed-in prior, in the directions of ``targets`` (P, D)."""
@@ -346,174 +334,7 @@ class GazeTrainer(Trainer, ABC):
         return out
 
 
-# ---- State of a gaze training in a file: both fits and the validation results ----
-
-KIND = "gaze run"
-STAGES = ("fit", "refit")
-
-
-@dataclass(frozen=True, kw_only=True)
-class StateSettings:
-    """Where the state of a run is stored, and whether to resume from it."""
-
-    path: Path | None = None  # State file; None: no state is stored
-    resume: bool = False  # Resume from the state file; probes and depths are computed again
-    interval: float = 60.0  # Seconds between two states. The state is also written if the run is interrupted.
-    # Additional data that must match for a run to be resumed (JSON), such as the files of its geometry.
-    identity: dict = field(default_factory=dict)
-
-
-def read_run_identity(state: StateSettings) -> dict | None:
-    """Return the identity of the run to resume (`GazePlan.make_identity`), or None for a new run.
-
-    Raises `NergError` if there is no state or the file is damaged.
-    """
-    if not state.resume:
-        return None
-    path = _require_state_file(state.path)
-    with reading_run_state(path):
-        identity = read_checkpoint(path, KIND)[1]["about"]
-        if not isinstance(identity, dict):
-            raise TypeError("it has no identity of the run")
-    return identity
-
-
-def _require_state_file(path: Path | None) -> Path:
-    if path is None or not path.is_file():
-        raise NergError(
-            f'cannot resume: the state file "{path}" does not exist; leave out {parameter("resume", True)} to '
-            "start a new run"
-        )
-    return path
-
-
-class GazeRunFile:
-    """State of one training in a file.
-
-    Parameters
-    ----------
-    path : Path or None
-        State file; None: no state is stored.
-    identity : dict
-        Data that must match for a run to be resumed (JSON).
-    interval : float
-        Seconds between two states.
-    resume : bool
-        Read the state at once. Raises `NergError` if there is none, or if it belongs to another run.
-
-    Attributes
-    ----------
-    stage : str or None
-        Stage of the state, ``fit`` or ``refit``.
-    seconds : float
-        Time spent before this process.
-    """
-
-    def __init__(self, path: Path | None, identity: dict, interval: float = 60.0, resume: bool = False):
-        self.path, self.identity, self.interval = path, identity, interval
-        self.stage, self.validation_state, self.seconds, self._tensors = None, {}, 0.0, {}
-        self._started = self._last_saved = time.perf_counter()
-        if resume:
-            path = _require_state_file(path)
-            self._tensors, self._meta = read_checkpoint(path, KIND)
-            with reading_run_state(path):
-                check_same_run(path, self._meta["about"], identity)
-                self.stage, self.validation_state = self._meta["stage"], self._meta["found"]
-                self.seconds = read_count(self._meta, "spent")
-                if self.stage not in STAGES:
-                    raise ValueError(f'its "stage" is {sanitize(self.stage, 40)}; expected one of {", ".join(STAGES)}')
-                GazeFit.from_dict(self.validation_state)
-
-    @property
-    def elapsed(self) -> float:
-        """Wall time of the run in seconds, excluding the time between an interruption and its resumption."""
-        return self.seconds + time.perf_counter() - self._started
-
-    def restore(self, stage: str, trainer: GazeTrainer) -> dict:
-        """Restore ``trainer`` if the state is one of ``stage``; returns the best weights that `save` was given."""
-        if self.path is None or stage != self.stage or "random" not in self._meta:
-            return {}
-        with reading_run_state(self.path):
-            trainer.restore(self._tensors, self._meta)
-            best = {k: v for k, v in trainer.averaged.items() if f"best.{k}" in self._tensors}
-            for k, v in best.items():
-                check_shape(self._tensors, f"best.{k}", v)
-            return {k: type(v)(self._tensors[f"best.{k}"]) for k, v in best.items()}
-
-    def save(
-        self, stage: str, trainer: GazeTrainer | None, validation_state: dict, weights: dict, force: bool = False
-    ) -> None:
-        """Write the state atomically if the interval has passed (or with ``force``).
-
-        Parameters
-        ----------
-        stage : str
-            Stage of the run.
-        trainer : GazeTrainer or None
-            Current trainer; None between two fits.
-        validation_state : dict
-            Validation results so far (JSON).
-        weights : dict
-            Best weights so far.
-        force : bool
-            Write even if the interval has not passed.
-        """
-        if self.path is None or not (force or time.perf_counter() - self._last_saved > self.interval):
-            return
-        tensors, meta = {f"best.{k}": v.numpy() for k, v in weights.items()}, {}
-        if trainer is not None:
-            state, meta = trainer.get_state()
-            tensors |= state
-        write_checkpoint(
-            self.path,
-            KIND,
-            tensors,
-            {"about": self.identity, "stage": stage, "found": validation_state, "spent": self.elapsed, **meta},
-        )
-        self._last_saved = time.perf_counter()
-
-
-# ---- Training plan: architecture, settings and trainer ----
-
-
-@dataclass(frozen=True, kw_only=True)
-class GazePlan:
-    """Architecture, settings and trainer of a training, without its data and geometry."""
-
-    config: GazeHeadConfig  # Architecture of the field
-    # Alternative architectures that folds may select (`gaze_run.select_variant`).
-    alternatives: tuple[GazeHeadConfig, ...] = ()
-    settings: GazeSettings  # Optimisation settings
-    probes: ProbeSettings  # How rays become probes
-    trainer: type[GazeTrainer]  # Trainer class of this kind of field
-    # Initial arrays by name (`GazeTrainer.init_from_radiance`); None: random initialisation.
-    initial_arrays: dict[str, Any] | None = None
-
-    def with_settings(self, **changes: Any) -> GazePlan:
-        """Return the plan with changed ``settings``."""
-        return replace(self, settings=replace(self.settings, **changes))
-
-    def make_identity(self, supervision: Supervision, geometry: Environment, state: StateSettings) -> dict:
-        """Return the data that must match for a run to be resumed (JSON)."""
-        return {
-            **state.identity,
-            **supervision.compute_digest(),
-            "settings": self.settings.to_dict(),
-            "probes": self.probes.to_dict(),
-            "architecture": self.config.to_dict(),
-            "box": geometry.box.to_dict(),
-            "align": alignment_to_json(geometry),
-        }
-
-
-def alignment_to_json(geometry: Environment) -> list[list[float]] | None:
-    """Return the similarity from the frame of the rays to that of the geometry as JSON; None if both are the same."""
-    return None if geometry.align.is_identity else geometry.align.matrix.tolist()
-
-
-# ---- Fit ----
-#
-# The two fits of a training: one with validation, and a refit on all data for the best number of steps.
+# ---- Progress of a run, which trains several fields ----
 
 
 @dataclass(frozen=True)
@@ -531,144 +352,34 @@ class GazeProgress:
 ProgressCallback = Callable[[GazeProgress], object]
 
 
-_FIT_STATE = {
-    **dict.fromkeys(("best_step?", "schedule?", "since?", "next_look?"), INDEX),
-    "history?": Items({"steps": INDEX}),
-}
+class StagedProgress:
+    """Reports the stages of a run as fractions of the whole, which never fall.
 
-
-@dataclass
-class GazeFit:
-    """Result of a fit."""
-
-    trainer: Any = None  # The `GazeTrainer`; None if restored from the state of an earlier process
-    weights: dict = field(default_factory=dict)  # Best weights
-    best_step: int = 0  # Step of the best weights
-    schedule: int = 0  # Number of steps that the schedule spans
-    scores: Scores | None = None  # Scores of the best weights
-    history: list[dict] = field(default_factory=list)  # All validations (JSON)
-    interrupted: bool = False  # Whether Ctrl-C ended the fit
-    evaluations_since_best: int = 0  # Validations since the best
-    next_evaluation: int = 0  # Index of the next validation
-
-    def to_dict(self) -> dict:
-        """Return the validation results for the run state (JSON)."""
-        scores = None if self.scores is None else [float(v) for v in self.scores]
-        return {
-            **{k: getattr(self, k) for k in ("best_step", "schedule", "history")},
-            "since": self.evaluations_since_best,
-            "next_look": self.next_evaluation,
-            "scores": scores,
-        }
-
-    @staticmethod
-    def from_dict(data: dict[str, Any], trainer: GazeTrainer | None = None, weights: dict | None = None) -> GazeFit:
-        """Restore a fit from `to_dict`. Raises ``ValueError`` or ``TypeError`` for other ``data``."""
-        check_json(data, _FIT_STATE, "found")
-        names = {"since": "evaluations_since_best", "next_look": "next_evaluation"}
-        values = {names.get(k, k): v for k, v in data.items()}
-        scores = values.pop("scores", None)
-        return GazeFit(trainer, weights or {}, scores=None if scores is None else Scores(*scores), **values)
-
-
-def fit_with_validation(
-    targets: GazeTargets,
-    validation: GazeTargets | None,
-    box: AnyBox,
-    plan: GazePlan,
-    ns: ModuleType,
-    minutes_fraction: float,
-    file: GazeRunFile,
-    on_progress: ProgressCallback,
-) -> GazeFit:
-    """Train until the schedule ends, or until ``patience`` validations bring no improvement.
-
-    ``minutes_fraction`` is the fraction of the time limit for this fit.
+    A stage covers a part of the fraction that is left, in proportion to its cost and to those of the later stages. So a
+    stage that ends early leaves more to the others.
     """
-    settings = plan.settings
-    if settings.minutes is not None:
-        settings = replace(settings, minutes=settings.minutes * minutes_fraction)
-    trainer = plan.trainer(targets, box, plan.config, settings, ns, initial=plan.initial_arrays)
-    out = GazeFit.from_dict(file.validation_state, trainer, file.restore("fit", trainer))
-    out.schedule = settings.steps or 0
-    evaluation_times, last_scores = np.arange(1, settings.num_validations + 1) / settings.num_validations, out.scores
-    with Interruption() as stop:
-        while (
-            trainer.progress < 1
-            and not out.interrupted
-            and not (settings.patience and out.evaluations_since_best >= settings.patience)
-        ):
-            trainer.step()
-            if validation is not None and trainer.progress >= evaluation_times[out.next_evaluation]:
-                out.next_evaluation = min(
-                    int(np.searchsorted(evaluation_times, trainer.progress, "right")), len(evaluation_times) - 1
-                )
-                last_scores = trainer.evaluate(validation)
-                out.history.append({"steps": trainer.steps, **round_scores(last_scores)})
-                out.evaluations_since_best += 1
-                if out.scores is None or np.isnan(out.scores.loss) or last_scores.loss < out.scores.loss:
-                    out.weights, out.best_step, out.scores, out.evaluations_since_best = (
-                        trainer.copy_weights(),
-                        trainer.steps,
-                        last_scores,
-                        0,
-                    )
-            file.save("fit", trainer, out.to_dict(), out.weights)
-            out.interrupted = _is_interrupted(
-                stop, on_progress, GazeProgress("fit", trainer.progress, trainer.steps, trainer.seconds, last_scores)
-            )
-    if out.interrupted:
-        file.save("fit", trainer, out.to_dict(), out.weights, force=True)
-    if validation is not None and out.scores is None and trainer.steps:
-        out.scores, out.best_step, out.weights = trainer.evaluate(validation), trainer.steps, trainer.copy_weights()
-    if not out.weights:
-        out.weights, out.best_step = trainer.copy_weights(), trainer.steps
-    if settings.minutes is not None:
-        # Convert the time-based schedule to steps, so that a refit can follow the same schedule.
-        out.schedule = max(trainer.steps, round(trainer.steps / max(trainer.progress, 1e-6)))
-    return out
+
+    def __init__(self, on_progress: ProgressCallback):
+        self._on_progress, self._fraction = on_progress, 0.0
+
+    def start(self, cost: float, *later: float) -> ProgressCallback:
+        """Return the callback of a stage of this ``cost`` that is followed by stages of the costs ``later``."""
+        begin = self._fraction
+        length = (1 - begin) * cost / max(cost + sum(later), 1e-9)
+
+        def report(progress: GazeProgress) -> None:
+            self._fraction = max(self._fraction, begin + length * progress.fraction)
+            self._on_progress(replace(progress, fraction=self._fraction))
+
+        return report
 
 
-def refit(
-    targets: GazeTargets,
-    first: GazeFit,
-    box: AnyBox,
-    plan: GazePlan,
-    ns: ModuleType,
-    file: GazeRunFile,
-    on_progress: ProgressCallback,
-) -> GazeFit:
-    """Train for the best number of steps of the ``first`` fit, with the same schedule."""
-    settings = replace(plan.settings, steps=first.best_step, minutes=None)
-    trainer = plan.trainer(targets, box, plan.config, settings, ns, first.schedule, plan.initial_arrays)
-    file.restore("refit", trainer)
-    interrupted = False
-    with Interruption() as stop:
-        while trainer.steps < first.best_step and not interrupted:
-            trainer.step()
-            file.save("refit", trainer, first.to_dict(), {})
-            fraction = trainer.steps / first.best_step
-            interrupted = _is_interrupted(
-                stop, on_progress, GazeProgress("refit", fraction, trainer.steps, trainer.seconds, first.scores)
-            )
-    if interrupted:
-        file.save("refit", trainer, first.to_dict(), {}, force=True)
-    return GazeFit(trainer, trainer.copy_weights(), trainer.steps, first.schedule, first.scores, [], interrupted)
-
-
-def _is_interrupted(stop: Interruption, tell: ProgressCallback, progress: GazeProgress) -> bool:
-    """Report ``progress`` and return whether Ctrl-C was pressed.
-
-    Ctrl-C is only handled here, because within a step weights and random numbers are inconsistent.
+def scale_progress(on_progress: ProgressCallback, k: int, count: int, stage: str) -> ProgressCallback:
+    """Return a callback that reports part ``k`` of ``count`` as progress of the whole; ``stage`` formats the stage
+    names.
     """
-    try:
-        tell(progress)
-        stop.check()
-    except KeyboardInterrupt:
-        return True
-    return False
 
+    def report(progress: GazeProgress) -> None:
+        on_progress(replace(progress, stage=stage.format(progress.stage), fraction=(k + progress.fraction) / count))
 
-def round_scores(scores: Scores) -> dict[str, float]:
-    """Return ``scores`` by name, rounded to five digits (JSON)."""
-    return {k: round(float(v), 5) for k, v in scores._asdict().items()}
+    return report

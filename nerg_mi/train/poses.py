@@ -13,6 +13,7 @@ from nerg_mi.errors import NergError, parameter
 from nerg_mi.figures.maps import camera_figure
 from nerg_mi.figures.style import changed_arguments, make_provenance, save
 from nerg_mi.files.atomic import check_new_folder, create_folder_atomically, make_folder
+from nerg_mi.files.html import Summary
 from nerg_mi.files.tables import write_json
 from nerg_mi.files.values import FilePath, to_path
 from nerg_mi.photos.colmap import read_colmap
@@ -43,8 +44,8 @@ _ADVICE = (
 )
 
 
-@dataclass(frozen=True)
-class PosesResult:
+@dataclass(frozen=True, repr=False)
+class PosesResult(Summary):
     """Result of a pose estimation.
 
     Attributes
@@ -164,8 +165,17 @@ def find_poses(
                 skipped = [*ignored, *unused]
             else:
                 copies = copy_frames(pictures, num_frames, folders, max_image_size, threads, copied)
-            _check_count(pictures, copies, skipped)
-            _report_pictures(copies, skipped, reporter)
+            if len(copies) < MIN_PHOTOS:
+                why = f"; {skipped[0]}" if skipped else ""
+                raise NergError(
+                    f'"{pictures}" has {len(copies)} usable images, and pose estimation needs at least {MIN_PHOTOS} of '
+                    f"the same scene{why}"
+                )
+            for line in describe_unused(skipped):
+                reporter.message(line)
+            sizes = sorted({p.size for p in copies})
+            shown = ", ".join(f"{w} x {h}" for w, h in sizes[:4]) + (", ..." if len(sizes) > 4 else "")
+            reporter.message(f"{len(copies)} images of {shown} pixels")
             structure = reconstruct(copies, Path(work), settings, lambda *now: _progress(reporter, *now))
             if structure is None:
                 raise NergError(
@@ -192,15 +202,6 @@ def find_poses(
     return result
 
 
-def _check_count(pictures: Path, copies: list[PhotoCopy], skipped: list[UnusedFrame]) -> None:
-    if len(copies) < MIN_PHOTOS:
-        why = f"; {skipped[0]}" if skipped else ""
-        raise NergError(
-            f'"{pictures}" has {len(copies)} usable images, and pose estimation needs at least {MIN_PHOTOS} of '
-            f"the same scene{why}"
-        )
-
-
 def _progress(reporter: Reporter, stage: str, done: int, total: int) -> None:
     names = list(STAGES)
     after = [*STAGES.values(), 1.0][names.index(stage) + 1]
@@ -213,14 +214,6 @@ def _progress(reporter: Reporter, stage: str, done: int, total: int) -> None:
         "writing": "writing",
     }
     reporter.progress(min(share, 1.0), text[stage])
-
-
-def _report_pictures(copies: list[PhotoCopy], skipped: list[UnusedFrame], reporter: Reporter) -> None:
-    for line in describe_unused(skipped):
-        reporter.message(line)
-    sizes = sorted({p.size for p in copies})
-    shown = ", ".join(f"{w} x {h}" for w, h in sizes[:4]) + (", ..." if len(sizes) > 4 else "")
-    reporter.message(f"{len(copies)} images of {shown} pixels")
 
 
 def _make_report(

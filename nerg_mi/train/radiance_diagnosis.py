@@ -33,6 +33,8 @@ class Outcome:
         the same on training views.
     result
         Row of ``history`` that the result has; None without validation views.
+    psnr
+        PSNR in dB of the result on held-out views that did not choose it; None without any.
     steps, seconds
         Length of the training.
     stride
@@ -45,6 +47,7 @@ class Outcome:
 
     history: list[dict]
     result: dict | None
+    psnr: float | None
     steps: int
     stride: int
     minutes: float | None
@@ -54,16 +57,16 @@ class Outcome:
     @property
     def gap(self) -> float:
         """PSNR of training views minus that of held-out views in dB; 0 if unknown."""
-        if self.result is None or self.result.get("psnr_train") is None:
+        if self.psnr is None or self.result is None or self.result.get("psnr_train") is None:
             return 0.0
-        return self.result["psnr_train"] - self.result["psnr"]
+        return self.result["psnr_train"] - self.psnr
 
     @property
     def is_poor(self) -> bool:
         """Whether the result predicts held-out views badly."""
-        if self.result is None:
+        if self.psnr is None:
             return False
-        return self.result["psnr"] < (SOUND_PSNR if self.gap > MAX_GAP else MIN_PSNR)
+        return self.psnr < (SOUND_PSNR if self.gap > MAX_GAP else MIN_PSNR)
 
 
 def find_problems(outcome: Outcome, causes: list[str]) -> list[str]:
@@ -87,19 +90,19 @@ def find_problems(outcome: Outcome, causes: list[str]) -> list[str]:
             f"cleared yet; use {remedy}"
         )
     # With too few steps, a lower PSNR is noise of an unfinished training.
-    if steps < MIN_STEPS or outcome.result is None:
+    if steps < MIN_STEPS:
         return out
-    best, last = outcome.result, history[-1]["psnr"]
-    if best["psnr"] - last > _MAX_DROP:
+    best, last = outcome.result, history[-1]["psnr"] if history else 0.0
+    if best is not None and best["psnr"] - last > _MAX_DROP:
         out.append(
-            f"held-out views were best at step {best['steps']} with {best['psnr']:.2f} dB, and had {last:.2f} dB "
+            f"validation views were best at step {best['steps']} with {best['psnr']:.2f} dB, and had {last:.2f} dB "
             f"at the end: the field of that step is the result, and more {parameter('minutes')} would not improve "
             "it"
         )
     if outcome.is_poor:
         training = f", training views {outcome.gap:.1f} dB more" if outcome.gap > 0 else ""
         likely = f"; likely causes: {'; '.join(causes)}" if causes else ""
-        out.append(f"held-out views have {best['psnr']:.1f} dB{training}: this field is of poor quality{likely}")
+        out.append(f"held-out views have {outcome.psnr:.1f} dB{training}: this field is of poor quality{likely}")
     return out
 
 
@@ -142,7 +145,8 @@ def find_causes(views: list[PhotoView], exposure_stops: float = 0.0, outside_fra
     for view in views:
         grey = view.composite_over(0.5).mean(axis=2)
         blank.append(_measure_blank(grey))
-        sharpness.append(_measure_sharpness(grey))
+        # The mean absolute second difference across rows and columns; 0 for tiny pictures
+        sharpness.append(float(sum(np.abs(np.diff(grey, 2, axis=k)).sum() for k in (0, 1))) / max(grey.size, 1))
     if np.mean(blank) > _MAX_BLANK:
         out.append(
             f"{np.mean(blank):.0%} of the photos' area has hardly any texture: if an object was turned in front of its "
@@ -172,11 +176,6 @@ def find_causes(views: list[PhotoView], exposure_stops: float = 0.0, outside_fra
     if len(blurred) > _MAX_BLURRED * len(views):
         out.append(f"{len(blurred)} photos are blurred: remove {format_names(blurred, 3)}")
     return out
-
-
-def _measure_sharpness(grey: np.ndarray) -> float:
-    """Return the mean absolute second difference of ``grey`` (h, w) across rows and columns; 0 for tiny pictures."""
-    return float(sum(np.abs(np.diff(grey, 2, axis=k)).sum() for k in (0, 1))) / max(grey.size, 1)
 
 
 def _measure_blank(grey: np.ndarray) -> float:

@@ -28,7 +28,7 @@ NUM_PARTS = 8
 GRID_STATE = ("value", "bits", "seen", "always")  # Arrays of the grid in the run state
 
 
-class DensityGrid:
+class MarchGrid:
     """Decaying maxima of σ times ``step``, and the cells in which samples are taken.
 
     Parameters
@@ -344,7 +344,7 @@ class DensityGrid:
 # From some step on, every cell that rendering will visit is sampled. These cells are found one piece per step.
 #
 # Cells that were not sampled have stopped training, and hash collisions fill them with artefacts that appear once a
-# picture is rendered with the extracted occupancy (`DensityGrid.extract_occupancy`). The last part of a run must clear
+# picture is rendered with the extracted occupancy (`MarchGrid.extract_occupancy`). The last part of a run must clear
 # them. Extracting the occupancy at once would take as long as hundreds of steps.
 
 
@@ -354,7 +354,7 @@ _RAY_GROUPS = 32  # Groups of training rays that decide which cells contribute
 
 
 class OccupancyExtraction:
-    """Incremental approximation of `DensityGrid.extract_occupancy` with fewer points per cell and fewer rays.
+    """Incremental approximation of `MarchGrid.extract_occupancy` with fewer points per cell and fewer rays.
 
     Attributes
     ----------
@@ -369,7 +369,7 @@ class OccupancyExtraction:
     PROBE_PIECES = len(_STRATA) * NUM_PARTS
     NUM_PIECES = PROBE_PIECES + _RAY_GROUPS
 
-    def __init__(self, grid: DensityGrid):
+    def __init__(self, grid: MarchGrid):
         self.grid, self.pieces_done = grid, 0
         self.dilated_dense: Any = None
         self.dense_cells, self.contributing_cells = (dr.zeros(grid.ns.UInt8, grid.resolution**3) for _ in range(2))
@@ -401,7 +401,7 @@ class OccupancyExtraction:
         Parameters
         ----------
         density : callable
-            As for `DensityGrid.extract_occupancy`.
+            As for `MarchGrid.extract_occupancy`.
         contributing_points : callable
             ``contributing_points(density, occupied, rng)`` returns points (Array3f, world) of visible samples on some
             training rays, or None.

@@ -11,7 +11,7 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.fields.encoding import HashGrid, encode_direction
-from nerg_mi.fields.mlp import MLP
+from nerg_mi.fields.mlp import MLP, stack, unstack
 from nerg_mi.fields.radiance import (
     RadianceConfig,
     color_network_inputs,
@@ -183,68 +183,8 @@ def composite(sigma: Float, parts: list, samples: RaySamples) -> tuple[Float, Fl
 # ---- Forward pass with the networks as tensor products, which trains fastest ----
 
 
-def stack(rows: list, ns):
-    """Stack rows (Floats of one length, or constants) to a TensorXf (N, columns).
-
-    Columns of zeros follow up to a multiple of eight, which Dr.Jit stores at once.
-    """
-    return dr.custom(_Stack, [*rows, *[ns.Float(0)] * (-len(rows) % 8)], ns)
-
-
-def unstack(x, ns) -> list:
-    """Split a TensorXf (N, columns) into its columns as Floats."""
-    return dr.custom(_Unstack, x, ns)
-
-
-class _Stack(dr.CustomOp):
-    """Dr.Jit's own derivative would load one number at a time, and that of `_Unstack` add one atomically."""
-
-    def eval(self, rows, ns):
-        self.ns = ns
-        return _join(rows, ns)
-
-    def forward(self):
-        self.set_grad_out(_join(self.grad_in("rows"), self.ns))
-
-    def backward(self):
-        self.set_grad_in("rows", _split(self.grad_out(), self.ns))
-
-    def name(self):
-        return "stack of rows"
-
-
-class _Unstack(dr.CustomOp):
-    """Inverse of `_Stack`."""
-
-    def eval(self, x, ns):
-        self.ns = ns
-        return _split(x, ns)
-
-    def forward(self):
-        self.set_grad_out(_split(self.grad_in("x"), self.ns))
-
-    def backward(self):
-        self.set_grad_in("x", _join(self.grad_out(), self.ns))
-
-    def name(self):
-        return "columns of a matrix"
-
-
-def _join(rows: Any, ns):
-    columns = ns.ArrayXf(rows)
-    # Dr.Jit aborts if it stores several numbers at once of which one awaits additions.
-    dr.eval([x for x in columns if x.state == dr.VarState.Dirty])
-    flat = dr.ravel(columns, order="F")
-    return ns.TensorXf(flat, (dr.width(flat) // len(rows), len(rows)))
-
-
-def _split(x, ns) -> list:
-    width, rows = x.shape
-    return list(dr.gather(ns.ArrayXf, x.array, dr.arange(ns.UInt32, width), shape=(rows, width)))
-
-
 def evaluate_samples(config: RadianceConfig, box: AnyBox, parameters: dict, p, d, ns, features: list | None = None):
-    """Evaluate density and composited quantities at samples; the same model as ``RadianceField.density_features`` and
+    """Evaluate density and composited quantities at samples; the same model as ``RadianceNetwork.density_features`` and
     ``color``.
 
     Parameters

@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 
 from nerg_mi.errors import format_error
-from nerg_mi.fields.radiance import RadianceField
+from nerg_mi.fields.radiance import RadianceNetwork
 from nerg_mi.figures.style import make_provenance, save
 from nerg_mi.figures.training import psnr_figure
 from nerg_mi.files.images import write_png
@@ -124,7 +124,7 @@ class PreviewWriter:
             self._write(trainer, None, *strides)
         return strides is not None
 
-    def write_result(self, trainer: RadianceTrainer, field: RadianceField) -> None:
+    def write_result(self, trainer: RadianceTrainer, field: RadianceNetwork) -> None:
         """Write the preview of ``field``, the result of the training."""
         strides = self._choose_strides(trainer, max(MAX_PREVIEW_FRACTION * trainer.seconds, _LAST_SECONDS))
         self._write(trainer, field, *(strides or _list_strides(trainer)[-1]))
@@ -140,7 +140,7 @@ class PreviewWriter:
             per_sample = trainer.clock.seconds / max(trainer.clock.evaluations, 1)
         return per_sample * trainer.estimate_samples(self.view, stride) / every**2
 
-    def _write(self, trainer: RadianceTrainer, field: RadianceField | None, every: int, stride: int) -> None:
+    def _write(self, trainer: RadianceTrainer, field: RadianceNetwork | None, every: int, stride: int) -> None:
         import mitsuba as mi
 
         start = time.perf_counter()

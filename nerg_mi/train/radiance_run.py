@@ -15,7 +15,7 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.errors import NergError, clean_text, parameter
-from nerg_mi.fields.radiance import EMPTY, RadianceConfig, RadianceField
+from nerg_mi.fields.radiance import EMPTY, RadianceConfig, RadianceNetwork
 from nerg_mi.files.schema import INDEX, NUMBER, Items, Number, check_json
 from nerg_mi.formats.checkpoint import read_checkpoint, write_checkpoint
 from nerg_mi.interruption import Interruption
@@ -88,7 +88,7 @@ def evaluate_views(
     trainer: RadianceTrainer,
     views: list[PhotoView],
     every: int = 1,
-    field: RadianceField | None = None,
+    field: RadianceNetwork | None = None,
     on_view: Callable[[int], None] = lambda number: None,
 ) -> HeldOutError:
     """Compute the error on ``views``, on every ``every``-th unmasked pixel.
@@ -213,16 +213,17 @@ def train_field(
     preview: Path | None = None,
     curves: Path | None = None,
     observer: TrainingObserver | None = None,
-    write: Callable[[RadianceField, dict], None] | None = None,
+    write: Callable[[RadianceNetwork, dict], None] | None = None,
     on_warning: Callable[[str], None] = lambda text: None,
-) -> tuple[RadianceField, dict]:
+) -> tuple[RadianceNetwork, dict]:
     """Train a radiance field on ``dataset``, and return its best state on the validation views.
 
     Parameters
     ----------
     dataset : Dataset
-        Posed photos. Held-out views are only evaluated: a few of them coarsely during the run, and all of them at the
-        end, on every pixel unless that takes too many samples.
+        Posed photos. Held-out views are only evaluated: a few of them coarsely during the run, which choose the state
+        (`WatchedViews`), and all of them at the end, on every pixel unless that takes too many samples. The error of
+        the views that do not choose is the one to report.
     config : RadianceConfig
         Configuration of the field.
     settings : RadianceSettings
@@ -255,10 +256,11 @@ def train_field(
 
     Returns
     -------
-    field : RadianceField
+    field : RadianceNetwork
         Field with its occupancy.
     provenance : dict
-        Provenance (JSON), including problems of the result (``complaints``).
+        Provenance (JSON), including the names of the views that chose the state (``validation_views``) and problems of
+        the result (``complaints``).
 
     Notes
     -----
@@ -274,6 +276,7 @@ def train_field(
         "architecture": config.to_dict(),
         "box": dataset.box.to_dict(),
         "depth": depth,
+        "validation_views": watched.validation_names,
     }
     history = load_run(trainer, state, identity) if resume else []
     last_psnr = history[-1]["psnr"] if history else None
@@ -440,8 +443,8 @@ def _make_result(
     budget: Budget,
     on_progress: Callable[[float], None],
     on_extraction: Callable[[float], None],
-) -> tuple[RadianceField, dict]:
-    """Return the best field and its provenance with the error on all held-out views.
+) -> tuple[RadianceNetwork, dict]:
+    """Return the best field and its provenance with the error on held-out views.
 
     ``duration`` is the time in seconds and the fraction of it in which other programs had the processors;
     ``on_progress`` is called with the fraction of the scored views, ``on_extraction`` with that of the occupancy.
@@ -462,18 +465,11 @@ def _make_result(
     }
     if trainer.photos is not None:
         provenance["photo_stops"] = round(trainer.photos.compute_exposure_spread(trainer.averaged[PHOTO_PARAMETER]), 3)
+    provenance["validation_views"] = watched.validation_names
+    test_psnr = None
     if dataset.held_out:
-        on_progress(0.0)
-        every = trainer.choose_pixel_stride(dataset.held_out, budget.choose_final_samples())
-        count = len(dataset.held_out)
-        error = evaluate_views(trainer, dataset.held_out, every, field, lambda number: on_progress(number / count))
-        on_progress(1.0)
-        provenance["psnr_held_out"] = {
-            "mean": _round_decibels(error.mean),
-            "mean_fitted": _round_decibels(error.mean_fitted),
-            "every_pixel": every,
-            "views": {v.name: _round_decibels(p) for v, p in zip(dataset.held_out, error.psnr)},
-        }
+        provenance["psnr_held_out"] = scores = _score_held_out(trainer, dataset, watched, field, budget, on_progress)
+        test_psnr = scores["mean" if trainer.photos is None else "mean_fitted"]
         if field.box.is_contracted:
             every = trainer.choose_pixel_stride(watched.held_out, EVALUATION_SAMPLES)
             outside_fraction = compute_outside_fraction(
@@ -482,9 +478,9 @@ def _make_result(
             provenance["beyond_box"] = round(outside_fraction, 4)
     provenance["psnr_watched"] = {"views": [v.name for v in watched.held_out], "history": history, "result": result}
     outcome = Outcome(
-        history, result, trainer.steps, trainer.stride, trainer.settings.minutes, seconds, waiting_fraction
+        history, result, test_psnr, trainer.steps, trainer.stride, trainer.settings.minutes, seconds, waiting_fraction
     )
-    if result is not None:
+    if test_psnr is not None:
         provenance["quality"] = "poor" if outcome.is_poor else "usable"
     causes = []
     if outcome.is_poor:
@@ -494,6 +490,35 @@ def _make_result(
     return field, provenance
 
 
+def _score_held_out(
+    trainer: RadianceTrainer,
+    dataset: Dataset,
+    watched: WatchedViews,
+    field: RadianceNetwork,
+    budget: Budget,
+    on_progress: Callable[[float], None],
+) -> dict:
+    """Return the error on all held-out views (JSON).
+
+    The means are those of the views that did not choose the state, and in ``validation`` those of the views that did.
+    """
+    on_progress(0.0)
+    views, count = dataset.held_out, len(dataset.held_out)
+    every = trainer.choose_pixel_stride(views, budget.choose_final_samples())
+    error = evaluate_views(trainer, views, every, field, lambda number: on_progress(number / count))
+    on_progress(1.0)
+    has_chosen = [v.name in watched.validation_names for v in views]
+    test, validation = (
+        {
+            name: _round_decibels(mean_ignoring_nan([p for p, c in zip(values, has_chosen) if c == is_validation]))
+            for name, values in (("mean", error.psnr), ("mean_fitted", error.psnr_fitted))
+        }
+        for is_validation in (False, True)
+    )
+    each = {v.name: _round_decibels(p) for v, p in zip(views, error.psnr)}
+    return {**test, "every_pixel": every, "views": each, "validation": validation}
+
+
 def _choose_state(
     trainer: RadianceTrainer,
     watched: WatchedViews,
@@ -501,7 +526,7 @@ def _choose_state(
     seconds: float,
     budget: Budget,
     on_extraction: Callable[[float], None],
-) -> tuple[RadianceField, dict | None]:
+) -> tuple[RadianceNetwork, dict | None]:
     """Return the field of the last state, or of the best one if that is better as a result, and its evaluation.
 
     The last state is appended to ``history``, and the evaluation of the best one replaced if it was repeated;
@@ -530,27 +555,41 @@ def _round_decibels(decibels: float) -> float | None:
 
 @dataclass(frozen=True)
 class WatchedViews:
-    """A few views that are evaluated during training: ``held_out`` ones, and ones of the ``training``."""
+    """A few views that are evaluated during training: ``held_out`` ones, and ones of the ``training``.
+
+    The held-out ones choose the state (``is_choosing``). They are at most half of all held-out views, so that others
+    remain to score the result. A single held-out view scores it, and the last state is the result: training on one
+    photo less to choose would cost more than the choice gains.
+    """
 
     held_out: list[PhotoView]
     training: list[PhotoView]
+    is_choosing: bool
 
     @staticmethod
     def choose(dataset: Dataset) -> WatchedViews:
         """Choose views at equal intervals."""
+        num_choosing = min(_NUM_VALIDATION_VIEWS, len(dataset.held_out) // 2)
         return WatchedViews(
-            pick_evenly(dataset.held_out, _NUM_VALIDATION_VIEWS), pick_evenly(dataset.train, _NUM_TRAINING_VIEWS)
+            pick_evenly(dataset.held_out, max(num_choosing, 1)),
+            pick_evenly(dataset.train, _NUM_TRAINING_VIEWS),
+            num_choosing > 0,
         )
+
+    @property
+    def validation_names(self) -> list[str]:
+        """Names of the held-out views that choose the state."""
+        return [view.name for view in self.held_out] if self.is_choosing else []
 
 
 def _append_evaluation(
     trainer: RadianceTrainer,
     watched: WatchedViews,
     history: list,
-    field: RadianceField | None = None,
+    field: RadianceNetwork | None = None,
     seconds: float | None = None,
 ) -> dict | None:
-    """Append an evaluation to ``history``, keep the state if it is the best, and return the evaluation.
+    """Append an evaluation to ``history``, keep the state if it is the best so far, and return the evaluation.
 
     ``seconds`` is the time of the training, by default until now. None, and nothing is appended, without held-out
     views, or if all of their pixels are masked.
@@ -560,12 +599,12 @@ def _append_evaluation(
     if row["psnr"] is None:
         return None
     history.append(row)
-    if field is None:
+    if field is None and watched.is_choosing:
         trainer.keep_if_best(row)
     return row
 
 
-def _evaluate(trainer: RadianceTrainer, watched: WatchedViews, history: list, field: RadianceField | None) -> dict:
+def _evaluate(trainer: RadianceTrainer, watched: WatchedViews, history: list, field: RadianceNetwork | None) -> dict:
     """Return the PSNR of held-out and training views, on a subset of the pixels that takes little time.
 
     All evaluations of a run (``history``) cover the same pixels, because results on others differ by tenths of a dB.

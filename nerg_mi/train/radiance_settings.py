@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from nerg_mi.errors import NergError
 from nerg_mi.ranges import (
@@ -295,44 +294,3 @@ class RadianceSettings(RunSettings):
             int(progress / self.stride_fraction * len(self.strides)) if self.stride_fraction > 0 else len(self.strides)
         )
         return self.strides[stage] if stage < len(self.strides) else 1
-
-
-# Settings in checkpoints and states of earlier versions, and their current names.
-_OLD_SETTINGS = {
-    "count": "probes",
-    "cap": "max_rays",
-    "fresh": "resample_directions",
-    "weights": "ray_weights",
-    "mix_kappa": "prior_kappa",
-    "mix_folds": "prior_folds",
-    "integral": "integral_weight",
-    "zones": "validation_zones",
-    "frozen": "freeze",
-    "final_rate": "lr_final_ratio",
-    "hold": "lr_hold_fraction",
-    "average": "ema_decay",
-    "looks": "num_validations",
-    "watched": "validation_probes",
-    "watched_rays": "validation_min_rays",
-    "growth": "step_growth",
-    "reach": "damping_distance",
-    "reach_share": "damping_fraction",
-    "stop": "min_transmittance",
-    "thin_sure": "rr_weight",
-    "thin_least": "rr_min_probability",
-    "grid_every": "grid_interval",
-    "settle": "extraction_start",
-    "look_most": "max_prepass_batches",
-    "stride_share": "stride_fraction",
-    "huber": "huber_delta",
-    "final_depth": "depth_weight_final_ratio",
-    "replay": "hard_pixel_fraction",
-}
-
-
-def use_current_names(record: Mapping[str, Any]) -> dict[str, Any]:
-    """Return ``record``, the identity of a run or a provenance, with the current names of settings and probes."""
-    parts = {key: record[key] for key in ("settings", "probes") if isinstance(record.get(key), dict)}
-    return {**record} | {
-        key: {_OLD_SETTINGS.get(name, name): value for name, value in part.items()} for key, part in parts.items()
-    }

@@ -14,7 +14,7 @@ from drjit.opt import Adam
 
 from nerg_mi.errors import NergError, parameter
 from nerg_mi.fields.occupancy import refine_occupancy
-from nerg_mi.fields.radiance import RadianceConfig, RadianceField, mean_features
+from nerg_mi.fields.radiance import RadianceConfig, RadianceNetwork, mean_features
 from nerg_mi.formats.fields import read_number
 from nerg_mi.maths.arrays import copy_aligned
 from nerg_mi.maths.geometry import AnyBox
@@ -24,7 +24,7 @@ from nerg_mi.photos.images import PhotoView
 from nerg_mi.transport.quadrature import mean_depth_fraction
 
 from .radiance_data import FreeSpace, PixelBank, PixelBatch, find_focus_distances
-from .radiance_grid import GRID_STATE, NUM_PARTS, DensityGrid, OccupancyExtraction
+from .radiance_grid import GRID_STATE, NUM_PARTS, MarchGrid, OccupancyExtraction
 from .radiance_losses import (
     PHOTO_PARAMETER,
     LossInputs,
@@ -65,7 +65,7 @@ class Preview:
 
 
 def render_view(
-    field: RadianceField,
+    field: RadianceNetwork,
     is_occupied,
     table: StepTable,
     view: PhotoView,
@@ -77,7 +77,7 @@ def render_view(
 
     Parameters
     ----------
-    field : RadianceField
+    field : RadianceNetwork
         Field to render.
     is_occupied : callable
         Maps points (Array3f) and a mask to the mask of points in occupied cells.
@@ -207,7 +207,7 @@ class RadianceTrainer(Trainer):
         self.pixels = PixelBank(ns, views)
         self.use_depth = depth and self.pixels.has_depth
         self.use_points = not self.use_depth and settings.point_weight > 0 and len(self.pixels.points) > 0
-        self.current_field = RadianceField.random(config, box, ns, settings.seed)
+        self.current_field = RadianceNetwork.random(config, box, ns, settings.seed)
         # One photo has nothing to differ from.
         self.photos = PhotoColors(ns, len(views)) if settings.photo_colors and len(views) > 1 else None
         start = self.current_field.parameters() | (
@@ -222,7 +222,7 @@ class RadianceTrainer(Trainer):
         near = settings.near * box.side
         free_space = FreeSpace.find(views, near, settings.clear_fraction, settings.surrounding_fraction)
         self._ray_starts = ns.Float(free_space.ray_starts)
-        self.grid = DensityGrid(
+        self.grid = MarchGrid(
             ns,
             box,
             settings.resolution,
@@ -312,17 +312,14 @@ class RadianceTrainer(Trainer):
         """Return the step edges at a march ``stride``."""
         if stride not in self._tables:
             s, side = self.settings, self.box.side
+            # The largest distance from a camera to a corner of the box.
+            bounds = self.box.lower, self.box.upper
+            corners = np.array([[bounds[k][axis] for axis, k in enumerate(corner)] for corner in np.ndindex(2, 2, 2)])
+            far = float(max(np.linalg.norm(corners - c, axis=1).max() for c in self.pixels.centers))
             self._tables[stride] = StepTable(
-                self.ns, s.near * side, self._compute_far(), stride * self.march_step, stride * s.step_growth
+                self.ns, s.near * side, far, stride * self.march_step, stride * s.step_growth
             )
         return self._tables[stride]
-
-    def _compute_far(self) -> float:
-        """Return the maximum distance from a training camera to a point of the box."""
-        corners = np.array(
-            [[b[i] for i, b in zip(k, zip(self.box.lower, self.box.upper))] for k in np.ndindex(2, 2, 2)]
-        )
-        return float(max(np.linalg.norm(corners - c, axis=1).max() for c in self.pixels.centers))
 
     def evaluate_density(self, p, active):
         """Evaluate the current density at world points without gradient."""
@@ -341,54 +338,53 @@ class RadianceTrainer(Trainer):
     def step(self) -> None:
         """Run one optimisation step: draw rays, march, composite and update the weights."""
         with self.clock:
-            self._step()
-
-    def _step(self) -> None:
-        s, ns, max_prepass_samples = self.settings, self.ns, self.settings.max_prepass_samples
-        if self.progress >= s.free_space_end:
-            self.end_free_space()
-        self._update_density_grid()
-        self._refine_stride()
-        table = self.get_step_table(self.stride)
-        limit = limit_ray_count(
-            self.rays, self.prepass_samples_per_ray, table.steps, max_prepass_samples, _MAX_CANDIDATES * s.batch
-        )
-        # Odd, unlike the lengths of other arrays of a step: Dr.Jit evaluates arrays of equal length together, so that
-        # each coincidence would record other kernels.
-        self.rays = (limit - 1) | 1
-        index = self._draw_pixels()
-        point_depth = self._draw_points(index) if self.use_points else None
-        pixels = self.pixels.gather_batch(ns.UInt32(copy_aligned(index, np.uint32)))
-        rays = clip_rays(pixels.o, pixels.d, self.box, dr.gather(ns.Float, self._ray_starts, pixels.frame))
-        offset = ns.Float(copy_aligned(self.rng.random(self.rays, np.float32)))
-        thinning = (
-            RussianRoulette(s.rr_weight, s.rr_min_probability, int(self.rng.integers(2**63)))
-            if s.rr_min_probability < 1
-            else None
-        )
-        samples, covered = select_visible_samples(
-            rays,
-            table,
-            offset,
-            self.grid.is_occupied,
-            self._density_prepass,
-            s.min_transmittance,
-            s.batch,
-            thinning,
-            max_prepass_samples,
-            with_features=True,
-        )
-        self.steps += 1
-        if samples is None:
-            self.rays = adapt_ray_count(self.rays, 0, 0, s.batch, max_prepass_samples)
-            return
-        depth_errors = self._optimize_step(samples, pixels, covered, point_depth)
-        if depth_errors is not None:
-            self._update_hard_pixels(index[:covered], depth_errors)
-        self.prepass_samples_per_ray = samples.prepass_samples_per_ray
-        self.rays = adapt_ray_count(
-            self.rays, samples.count / covered, self.prepass_samples_per_ray, s.batch, max_prepass_samples
-        )
+            s, ns, max_prepass_samples = self.settings, self.ns, self.settings.max_prepass_samples
+            if self.progress >= s.free_space_end:
+                self.end_free_space()
+            self._update_density_grid()
+            self._refine_stride()
+            table = self.get_step_table(self.stride)
+            limit = limit_ray_count(
+                self.rays, self.prepass_samples_per_ray, table.steps, max_prepass_samples, _MAX_CANDIDATES * s.batch
+            )
+            # Odd, unlike the lengths of other arrays of a step: Dr.Jit evaluates arrays of equal length together, so
+            # that each coincidence would record other kernels.
+            self.rays = (limit - 1) | 1
+            index = self._draw_pixels()
+            point_depth = self._draw_points(index) if self.use_points else None
+            pixels = self.pixels.gather_batch(ns.UInt32(copy_aligned(index, np.uint32)))
+            rays = clip_rays(pixels.o, pixels.d, self.box, dr.gather(ns.Float, self._ray_starts, pixels.frame))
+            offset = ns.Float(copy_aligned(self.rng.random(self.rays, np.float32)))
+            thinning = (
+                RussianRoulette(s.rr_weight, s.rr_min_probability, int(self.rng.integers(2**63)))
+                if s.rr_min_probability < 1
+                else None
+            )
+            samples, covered = select_visible_samples(
+                rays,
+                table,
+                offset,
+                self.grid.is_occupied,
+                self._density_prepass,
+                s.min_transmittance,
+                s.batch,
+                thinning,
+                max_prepass_samples,
+                with_features=True,
+            )
+            self.steps += 1
+            if samples is None:
+                self.rays = adapt_ray_count(self.rays, 0, 0, s.batch, max_prepass_samples)
+                return
+            depth_errors = self._optimize_step(samples, pixels, covered, point_depth)
+            if depth_errors is not None:
+                # The newest pixels replace the oldest.
+                is_hard = depth_errors.numpy()[:covered] > _MIN_DEPTH_LOSS
+                self.hard_pixels = np.concatenate([self.hard_pixels, index[:covered][is_hard]])[-_MAX_HARD_PIXELS:]
+            self.prepass_samples_per_ray = samples.prepass_samples_per_ray
+            self.rays = adapt_ray_count(
+                self.rays, samples.count / covered, self.prepass_samples_per_ray, s.batch, max_prepass_samples
+            )
 
     def end_free_space(self) -> None:
         """Allow density in the empty space near the cameras from now on."""
@@ -469,11 +465,6 @@ class RadianceTrainer(Trainer):
         )
         return self.ns.Float(copy_aligned(distance)), self.ns.Float(copy_aligned(error))
 
-    def _update_hard_pixels(self, index: np.ndarray, depth_errors: Float) -> None:
-        """Add the pixels of this batch with a large depth error to the buffer, replacing the oldest."""
-        is_hard = depth_errors.numpy()[: len(index)] > _MIN_DEPTH_LOSS
-        self.hard_pixels = np.concatenate([self.hard_pixels, index[is_hard]])[-_MAX_HARD_PIXELS:]
-
     def _optimize_step(
         self, samples: RaySamples, pixels: PixelBatch, covered: int, point_depth: tuple[Float, Float] | None
     ) -> Float | None:
@@ -506,7 +497,8 @@ class RadianceTrainer(Trainer):
             if name.startswith("grid."):
                 gradient = gradient + feature_decay_gradient(weights[name], s.grid_decay)
             dr.set_grad(self.optimiser[name], gradient)
-        self.move_weights()
+        self.optimiser.set_learning_rate(s.learning_rate_at(self.progress))
+        self.optimiser.step()
         self.loss, self.samples = loss, samples.count
         if self.steps % self.AVERAGE_INTERVAL == 0:
             self.average_weights()
@@ -569,7 +561,7 @@ class RadianceTrainer(Trainer):
         height, width = view.shape
         return height * width * max(self.prepass_samples_per_ray * self.stride / stride, 1.0)
 
-    def render(self, view: PhotoView, every: int = 1, field: RadianceField | None = None, stride: int = 1) -> Preview:
+    def render(self, view: PhotoView, every: int = 1, field: RadianceNetwork | None = None, stride: int = 1) -> Preview:
         """Render every ``every``-th pixel of ``view`` with the trainer's march at a march ``stride``.
 
         Renders ``field`` with its own occupancy, or by default the averaged weights.
@@ -587,14 +579,14 @@ class RadianceTrainer(Trainer):
         with_occupancy: bool = True,
         snapshot: Snapshot | None = None,
         on_progress: Callable[[float], None] = lambda part: None,
-    ) -> RadianceField:
+    ) -> RadianceNetwork:
         """Return the field with averaged weights, and its occupancy for rendering if ``with_occupancy``.
 
         With a ``snapshot``, it is the field of that state, sampled in the cells that were sampled then.
         ``on_progress`` is called with the completed part of the extraction of the occupancy of the present state.
         """
         growth = self.settings.step_growth if self.box.is_contracted else 0.0
-        out = RadianceField.random(self.config, self.box, self.ns, 0, march_step=self.march_step, march_growth=growth)
+        out = RadianceNetwork.random(self.config, self.box, self.ns, 0, march_step=self.march_step, march_growth=growth)
         weights = self.averaged if snapshot is None else snapshot.weights
         out.set_parameters({k: type(v)(v) for k, v in weights.items() if k != PHOTO_PARAMETER})
         if not with_occupancy:

@@ -1,10 +1,10 @@
-"""Common parts of radiance and gaze training: schedule, averaged weights, run state and step clock."""
+"""Common parts of radiance and gaze training: settings, averaged weights, run state and step clock."""
 
 from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
@@ -18,8 +18,6 @@ from nerg_mi.files.safe_read import translate_read_errors
 from nerg_mi.files.schema import Items, Number, check_json
 from nerg_mi.formats.fields import read_number
 from nerg_mi.interruption import Interrupted
-
-from .radiance_settings import use_current_names
 
 # ---- Trainer ----
 
@@ -77,11 +75,6 @@ class Trainer:
         The rest of the schedule is spread over the rest of the time, so that its progress neither jumps nor falls.
         """
         self._reserved_at, self.reserved_seconds = (self.seconds, self.progress), seconds
-
-    def move_weights(self) -> None:
-        """Update the weights with the current gradients and learning rate."""
-        self.optimiser.set_learning_rate(self.settings.learning_rate_at(self.progress))
-        self.optimiser.step()
 
     def average_weights(self) -> None:
         """Update the exponential moving average of the weights."""
@@ -199,19 +192,69 @@ def saving_on_failure(path: Path | None, save: Callable[[], None], is_done: bool
         path.unlink(missing_ok=True)
 
 
+# Settings in checkpoints and states of earlier versions, and their current names.
+_OLD_SETTINGS = {
+    "count": "probes",
+    "cap": "max_rays",
+    "fresh": "resample_directions",
+    "weights": "ray_weights",
+    "mix_kappa": "prior_kappa",
+    "mix_folds": "prior_folds",
+    "integral": "integral_weight",
+    "zones": "validation_zones",
+    "frozen": "freeze",
+    "final_rate": "lr_final_ratio",
+    "hold": "lr_hold_fraction",
+    "average": "ema_decay",
+    "looks": "num_validations",
+    "watched": "validation_probes",
+    "watched_rays": "validation_min_rays",
+    "growth": "step_growth",
+    "reach": "damping_distance",
+    "reach_share": "damping_fraction",
+    "stop": "min_transmittance",
+    "thin_sure": "rr_weight",
+    "thin_least": "rr_min_probability",
+    "grid_every": "grid_interval",
+    "settle": "extraction_start",
+    "look_most": "max_prepass_batches",
+    "stride_share": "stride_fraction",
+    "huber": "huber_delta",
+    "final_depth": "depth_weight_final_ratio",
+    "replay": "hard_pixel_fraction",
+}
+
+
+def use_current_names(record: Mapping[str, Any]) -> dict[str, Any]:
+    """Return ``record``, the identity of a run or a provenance, with the current names of settings and probes."""
+    parts = {key: record[key] for key in ("settings", "probes") if isinstance(record.get(key), dict)}
+    return {**record} | {
+        key: {_OLD_SETTINGS.get(name, name): value for name, value in part.items()} for key, part in parts.items()
+    }
+
+
 def check_same_run(path: str | Path, then: dict, now: dict) -> None:
     """Raise `NergError` unless the identities ``then`` of the stored run and ``now`` of this run agree."""
     if not isinstance(then, dict):
         raise NergError(
             f'cannot resume the run in "{path}": its state is damaged; start again without {parameter("resume", True)}'
         )
-    then, now = use_current_names(then), json.loads(json.dumps(now))
-    different = [k for k in now if then.get(k) != now[k]]
+    different = list(_list_differences(use_current_names(then), json.loads(json.dumps(now))))
     if different:
         raise NergError(
             f'cannot resume the run in "{path}": it was started with different {", ".join(different)}; use the '
             f"same options and data, or start again without {parameter('resume', True)}"
         )
+
+
+def _list_differences(then: dict, now: dict) -> Iterator[str]:
+    """Yield the names of the values of ``now`` that ``then`` does not have, such as "settings.steps"."""
+    for name, value in now.items():
+        old = then.get(name)
+        if isinstance(old, dict) and isinstance(value, dict):
+            yield from (f"{name}.{part}" for part in _list_differences(old, value))
+        elif old != value:
+            yield name
 
 
 # ---- Duration of the steps and rate of field evaluations ----

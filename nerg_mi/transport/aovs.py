@@ -4,7 +4,7 @@ layers of the viewer, contact sheets and differences. A new AOV is one new entry
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, cast
 
@@ -354,19 +354,10 @@ def channel_names(names: Iterable[str], medium) -> list[str]:
     return [f"{name}.{channel}" for name in names for channel in AOVS[name].channel_suffixes(medium)]
 
 
-def compute_channels(names: Sequence[str], pixel: Any) -> list:
-    """All channels of these AOVs, in order."""
-    # Evaluation counts come last, when all other AOVs have been computed.
-    order = sorted((AOVS[name] for name in names), key=lambda aov: "counts" in aov.required_data)
-    channels_by_name = {aov.name: aov.compute(pixel if aov.is_per_observer else pixel.camera) for aov in order}
-    return [channel for name in names for channel in channels_by_name[name]]
-
-
 def format_manual() -> str:
     """The list of AOVs for the manual."""
-    return "\n".join(_entry(aov) for aov in AOVS.values())
-
-
-def _entry(aov: Aov) -> str:
-    channels = "``.0``, ``.1``, ..." if aov.channels is None else f"``{' '.join('.' + c for c in aov.channels)}``"
-    return textwrap.fill(f"- ``{aov.name}`` ({channels}): {aov.summary}", 120, subsequent_indent="  ")
+    entries = []
+    for aov in AOVS.values():
+        channels = "``.0``, ``.1``, ..." if aov.channels is None else f"``{' '.join('.' + c for c in aov.channels)}``"
+        entries.append(textwrap.fill(f"- ``{aov.name}`` ({channels}): {aov.summary}", 120, subsequent_indent="  "))
+    return "\n".join(entries)

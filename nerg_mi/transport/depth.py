@@ -164,11 +164,11 @@ class RefinedMedian(Median):
     def inside(self, context: MarchContext) -> Float:
         half = _Half(context)
         with dr.suspend_grad():
-            moved = self._moved(context, half)
+            moved = self._find_shift(context, half)
         return half.depth + moved
 
     @staticmethod
-    def _moved(context: MarchContext, half: _Half) -> Float:
+    def _find_shift(context: MarchContext, half: _Half) -> Float:
         """Shift of the crossing that the finer march finds."""
         result, settings, t1, second = context.result, context.settings, context.t1, half.again
         start = dr.select(half.rest, second.crossing_start, result.crossing_start)

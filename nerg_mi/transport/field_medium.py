@@ -9,7 +9,7 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.fields.mlp import namespace
-from nerg_mi.fields.radiance import RadianceField, mean_features
+from nerg_mi.fields.radiance import RadianceNetwork, mean_features
 from nerg_mi.maths.geometry import Similarity, intersect_box
 from nerg_mi.maths.types import Array3f, Bool, Color, Float, Point3f, Ray3f, Vector3f, variant_types
 
@@ -124,7 +124,7 @@ class FieldMedium:
     cells = None
     hits = None
 
-    def __init__(self, field: RadianceField, to_world: Similarity | None = None):
+    def __init__(self, field: RadianceNetwork, to_world: Similarity | None = None):
         self.field, self.to_world = field, to_world or Similarity()
         # A field scaled by s is s times longer, so its density per scene unit is s times lower.
         self._per_unit = 1 / self.to_world.scale

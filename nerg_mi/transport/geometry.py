@@ -287,6 +287,9 @@ def _cast(scene: Any, ray: Ray3f | SceneRay, active: Bool) -> tuple[Any, Float]:
 #
 # Radiance behind a medium: shapes lit by a nested integrator or, without light, by a headlight, or the background.
 
+SURFACE_OPACITY = 0.5
+"""Opacity from which a ray hits a surface; the default of the integrator."""
+
 HEADLIGHT = 0.7
 """Default fraction of the brightness of shapes without light that depends on their orientation."""
 
@@ -370,7 +373,12 @@ class Shading:
                 # Directly visible emitters are shapes; without any surface there is the background.
                 color = dr.select(ray_hit.hits_shape | valid, color, background)
             return color, aovs, visible & valid
-        behind = background if environment is None else environment.eval(_beyond(ray), visible)
+        behind = background
+        if environment is not None:
+            # The parts of an interaction that an emitter needs, for a ray that meets no surface.
+            beyond = dr.zeros(mi.SurfaceInteraction3f)
+            beyond.wi, beyond.wavelengths = -ray.d, ray.wavelengths
+            behind = environment.eval(beyond, visible)
         shown = active & (ray_hit.hits_shape | (environment is not None))
         if ray_hit.shape_intersection is None:
             return behind, [], shown
@@ -439,13 +447,6 @@ class _PathReplay(dr.CustomOp):
         return "path replay"
 
 
-def _beyond(ray: Ray3f) -> Any:
-    """The parts of an interaction that an environment emitter needs, for a ray that meets no surface."""
-    si: Any = dr.zeros(variant_types().SurfaceInteraction3f)
-    si.wi, si.wavelengths = -ray.d, ray.wavelengths
-    return si
-
-
 # ---- Batched tracing ----
 #
 # Depths along many rays outside of a rendering.
@@ -509,7 +510,7 @@ def trace_depth(
     geometry = as_scene_geometry(subject)
     settings = settings or default_march_settings(geometry)
     if dr.is_array_v(origins):
-        return _traced_jit(geometry, cast("Point3f", origins), cast("Vector3f", directions), settings, kind, batch)
+        return _trace_depth_jit(geometry, cast("Point3f", origins), cast("Vector3f", directions), settings, kind, batch)
     o, d = (np.asarray(v, np.float32) for v in (origins, directions))
     if o.shape != d.shape or o.ndim != 2 or o.shape[1] != 3:
         raise ValueError(f"origins {o.shape} and directions {d.shape} must both have shape (N, 3)")
@@ -523,7 +524,7 @@ def trace_depth(
     return depth, opacity
 
 
-def _traced_jit(
+def _trace_depth_jit(
     geometry: SceneGeometry, origins: Point3f, directions: Vector3f, settings: MarchSettings, kind: str, batch: int
 ) -> tuple[Float, Float]:
     count = max(dr.width(origins), dr.width(directions))

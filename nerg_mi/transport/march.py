@@ -45,11 +45,6 @@ from .quadrature import RULES, absorbed_fraction, cells_for_rule
 _INPUTS = ("o", "d", "w", "t0", "t1")
 
 
-def needs_gradients(medium: Medium, ray: LocalRay, t0: Float, t1: Float) -> bool:
-    """Whether the ray, its interval or the medium's parameters carry gradients."""
-    return any(dr.grad_enabled(x) for x in (ray.o, ray.d, ray.w, t0, t1, *medium.parameters()))
-
-
 def march_differentiably(
     operation: type[MarchOp], ray: LocalRay, t0: Float, t1: Float, request: MarchRequest
 ) -> MarchResult:
@@ -69,21 +64,10 @@ class _Replay(MarchSums):
 
     active: Bool
     color: Color
-
-
-@dataclass(kw_only=True)
-class _ReplayedSteps(_Replay):
-    """Replay state of a march in steps; the fields match those of the primal state."""
-
-    t: Float
-    fraction: Float
-
-
-@dataclass(kw_only=True)
-class _ReplayedHits(_Replay):
-    """Replay state of a march from hit to hit; ``index``: the next hit."""
-
-    index: UInt32
+    # Start of the next step, and its length as a fraction of a full one; of a march from hit to hit: the next hit.
+    t: Float | None = None
+    fraction: Float | None = None
+    index: UInt32 | None = None
 
 
 @dataclass
@@ -192,7 +176,7 @@ class MarchOp(dr.CustomOp):
         f, t0 = self.request, self.inputs[3]
         Float = type(t0)
         fraction, color = Float(1 if f.offset is None else f.offset), None if f.color is None else f.color.zero()
-        start = _ReplayedSteps(**zero_sums(Float), active=f.active, color=color, t=t0, fraction=fraction)
+        start = _Replay(**zero_sums(Float), active=f.active, color=color, t=t0, fraction=fraction)
         with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, True):
             _, extra = dr.while_loop((start, extra), lambda state, _: state.active, body, label="march adjoint")
         return extra
@@ -294,7 +278,7 @@ class HitMarchOp(MarchOp):
             return active & (farthest.t < dr.inf) & (state.tau < end), farthest, state, extra
 
         color = None if f.color is None else f.color.zero()
-        state = _ReplayedHits(**zero_sums(Float), active=f.active, color=color, index=UInt32(0))
+        state = _Replay(**zero_sums(Float), active=f.active, color=color, index=UInt32(0))
         first = position_before(t0)
         with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, True):
             out = dr.while_loop((f.active, first, state, extra), lambda active, *_: active, group, label="hits adjoint")
@@ -370,7 +354,7 @@ def march(
     active = dr.mask_t(Float)(active) & (t0 < t1)
     t0, t1 = Float(t0), Float(t1)
     request = MarchRequest(medium, active, settings, offset, color, count, until, fine_from, occlusion)
-    if needs_gradients(medium, ray, t0, t1):
+    if any(dr.grad_enabled(x) for x in (ray.o, ray.d, ray.w, t0, t1, *medium.parameters())):
         result = march_differentiably(MarchOp if medium.hits is None else HitMarchOp, ray, t0, t1, request)
     else:
         # An enclosing derivative, such as that of the albedo of a shape, evaluates loops: each step would be a kernel.

@@ -123,9 +123,11 @@ def gather_corners(mesh: Any, face: UInt32) -> list[Point3f]:
 
 
 def read_attribute(mesh: Any, name: str) -> np.ndarray | None:
-    """Return the attribute ``name``, of three channels, as (N, 3); None if the mesh has none of that name."""
+    """Return the first three channels of the attribute ``name`` of vertices or faces, (N, 3); None if the mesh has none
+    of that name."""
     params = variant_types().traverse(mesh)
-    return np.array(params[name]).reshape(-1, 3) if name in params else None
+    count = mesh.face_count() if name.startswith("face") else mesh.vertex_count()
+    return np.array(params[name]).reshape(count, -1)[:, :3] if name in params else None
 
 
 def write_ply(mesh: Any, path: str | Path) -> None:

@@ -80,29 +80,30 @@ class ObserverCache:
         -----
         While ``dr.freeze`` records a function, the cache is neither read nor written: values belong to the recording.
         """
-        entries = [CacheEntry(_detached(p_o), None) for p_o in observers]
+        entries = [CacheEntry(type(p_o)(dr.detach(p_o)), None) for p_o in observers]
+        for entry in entries:
+            # A literal position would compile a new kernel for each observer.
+            dr.make_opaque(entry.center)
         return self.get_or_compute(key, entries, dependencies, lambda k: compute(k.center))
-
-    def get_or_compute(
-        self, key: Hashable, entries: list[CacheEntry], dependencies: Any, compute: Callable[[CacheEntry], Any]
-    ) -> list[CacheEntry]:
-        """``compute(entry)`` for each of ``entries``, or its cached result; otherwise as `get_or_compute_each`."""
-        return self._get_or_compute(key, entries, dependencies, compute, 0)
 
     def get_or_compute_scalar(
         self, key: Hashable, entries: list[CacheEntry], dependencies: Any, compute: Callable[[CacheEntry], Any]
     ) -> list[CacheEntry]:
         """`get_or_compute` of a few scalars per observer; the entries of 256 earlier observers are kept, too."""
-        return self._numbers._get_or_compute(key, entries, dependencies, compute, _MAX_SCALARS)
+        return self._numbers.get_or_compute(key, entries, dependencies, compute, _MAX_SCALARS)
 
-    def _get_or_compute(
+    def get_or_compute(
         self,
         key: Hashable,
         entries: list[CacheEntry],
         dependencies: Any,
         compute: Callable[[CacheEntry], Any],
-        max_others: int,
+        max_others: int = 0,
     ) -> list[CacheEntry]:
+        """``compute(entry)`` for each of ``entries``, or its cached result; otherwise as `get_or_compute_each`.
+
+        ``max_others``: maximum number of entries of earlier observers that are kept.
+        """
         if is_recording():
             return [CacheEntry(k.center, compute(k)) for k in entries]
         slot = self._slots.get(key)
@@ -135,13 +136,6 @@ def fingerprint_geometry(geometry: SceneGeometry) -> tuple[Fingerprint, Fingerpr
     """Fingerprints of the shapes and of the medium's arrays."""
     values = [] if geometry.medium is None else [v for v in geometry.medium.parameters() if dr.is_array_v(v)]
     return fingerprint_shapes(geometry), Fingerprint(values)
-
-
-def _detached(p_o: Point3f) -> Point3f:
-    center = type(p_o)(dr.detach(p_o))
-    # A literal position would compile a new kernel for each observer.
-    dr.make_opaque(center)
-    return center
 
 
 # ---- Settings of an observer's rays ----
@@ -374,31 +368,3 @@ class ObservedSupport:
     def evaluate(self, r_o: Vector3f) -> Float:
         """The support; it does not depend on ``r_o``."""
         return self.total
-
-
-# ---- Visibility ----
-#
-# Whether an observer sees a point: the shadow factor of the paper, with its sign corrected.
-#
-# The section "Surface Visibility and Gaze Occlusion" of the paper compares the depth d_o of the surface along the
-# observer's ray with the distance d_o* to the point. s = clip((d_o* - d_o - tol) / d_f, 0, 1) is 1 if a surface lies in
-# between; gaze is multiplied by the visibility 1 - s. (The paper multiplies by s, which would show gaze only where it
-# is hidden.)
-
-
-def visibility(d_expected: Float, d_observed: Float, falloff: Float, tolerance: Float | float) -> Float:
-    """Visibility of a point: 1 visible, 0 hidden.
-
-    Parameters
-    ----------
-    d_expected, d_observed : Float
-        d_o*, the distance to the point, and d_o, the depth of the surface along the observer's ray; in scene units.
-    falloff : Float
-        d_f >= 0, in scene units; 0: a step function.
-    tolerance : Float or float
-        How much nearer than the point its own surface can be, in scene units.
-    """
-    excess = d_expected - d_observed - tolerance
-    sharp = falloff <= 0
-    soft = dr.clip(excess / dr.select(sharp, 1, falloff), 0, 1)
-    return 1 - dr.select(sharp, dr.select(excess > 0, 1.0, 0.0), soft)

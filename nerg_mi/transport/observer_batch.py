@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import drjit as dr
 import numpy as np
 
-from nerg_mi.fields.gaze_base import GazeHead
 from nerg_mi.fields.kde import SphericalKde
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.maths.arrays import to_vector
@@ -188,16 +187,17 @@ class _Block:
         for index, observer, direction in _launches(observers, count):
             directions = fibonacci_directions_jit(count, dr.gather(mi.UInt32, mi.UInt32(order), direction))
             lanes = self._trace(observer, directions, np.repeat(index, count) if self._miss_depths else None)
-            values = [self._unnormalized(member, lanes) for member in members]
+            values = []
+            for member in members:
+                emit, capture = self._instance.unnormalized(
+                    member, lanes.p_od, lanes.p_o, lanes.r_o, True, lanes.escaped
+                )
+                values.append(emit * capture + dr.zeros(mi.Float, dr.width(lanes.r_o)))
             dr.eval(values)
             integrand = np.empty((len(members), len(index), count), np.float32)
             for row, value in zip(integrand, values):
                 row[:, order] = np.array(value).reshape(len(index), count)
             yield index, integrand
-
-    def _unnormalized(self, member: GazeHead, lanes: _Lanes) -> Float:
-        emit, capture = self._instance.unnormalized(member, lanes.p_od, lanes.p_o, lanes.r_o, True, lanes.escaped)
-        return emit * capture + dr.zeros(variant_types().Float, dr.width(lanes.r_o))
 
     def _trace(self, observer, directions: Vector3f, index: np.ndarray | None) -> _Lanes:
         """Trace the rays of the observers with indices ``observer`` (UInt32); ``index``: the same in NumPy, sorted, if
@@ -210,20 +210,14 @@ class _Block:
             assert index is not None
             has_surface, distance = tracer.trace_surfaces(directions, tracer.miss_distance(directions))
             dr.eval(has_surface, distance)
-            distance, escaped = (
-                variant_types().Float(self._fill(has_surface, distance, directions, index)),
-                ~has_surface,
-            )
+            depth, missed, vectors = np.array(distance), ~np.array(has_surface), np.array(directions).T
+            starts = np.flatnonzero(np.diff(index, prepend=-1))
+            for start, end in zip(starts, [*starts[1:], len(index)]):
+                rows = slice(start, end)
+                self._miss_depths[index[start]].fill(depth[rows], missed[rows], vectors[rows])
+            distance, escaped = variant_types().Float(depth), ~has_surface
         dr.eval(distance, escaped)
         return _Lanes(tracer.center, directions, distance, escaped)
-
-    def _fill(self, has_surface: Bool, distance: Float, directions: Vector3f, index: np.ndarray) -> np.ndarray:
-        depth, missed, vectors = np.array(distance), ~np.array(has_surface), np.array(directions).T
-        starts = np.flatnonzero(np.diff(index, prepend=-1))
-        for start, end in zip(starts, [*starts[1:], len(index)]):
-            rows = slice(start, end)
-            self._miss_depths[index[start]].fill(depth[rows], missed[rows], vectors[rows])
-        return depth
 
     def _trace_miss_depths(self) -> Iterator[MissDepths]:
         vectors = np.array(fibonacci_directions_jit(MISS_DIRECTIONS)).T
@@ -239,7 +233,7 @@ class _Block:
         """A tracer of the rays of the observers with indices ``observer`` (UInt32)."""
         center = dr.gather(variant_types().Point3f, self._positions, observer)
         dr.eval(center)
-        return self._instance.make_tracer(self._geometry, center, self._settings)
+        return ObserverTracer(self._instance, self._geometry, center, self._settings)
 
 
 def _launches(observers: np.ndarray, count: int) -> Iterator[tuple[np.ndarray, UInt32, UInt32]]:

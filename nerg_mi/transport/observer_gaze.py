@@ -13,7 +13,7 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.fields.gaze_base import AnyGazeField, GazeHead, mean_over_members, std_over_members
+from nerg_mi.fields.gaze_base import GazeHead, GazeNetwork, mean_over_members, std_over_members
 from nerg_mi.fields.gaze_hits import ObservedHits
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.maths.arrays import to_vector
@@ -143,7 +143,7 @@ class SphereSampleCache:
     def get(self, count: int, tracer: ObserverTracer) -> SphereSamples:
         """The samples in ``count`` directions; ``tracer``: always that of the observer."""
         if count not in self._traced:
-            if tracer.field.config.fills_escaped and self.miss_depths is None:
+            if tracer.placed.field.config.fills_escaped and self.miss_depths is None:
                 self.miss_depths = tracer.trace_miss_depths()
             self._traced[count] = tracer.trace(count, self.miss_depths)
         return self._traced[count]
@@ -165,10 +165,9 @@ class MissDepths:
 @dataclass(frozen=True, eq=False)
 class ObserverTracer:
     """Traces the rays of the observer at ``center`` (one lane, or one per ray) through ``geometry`` with ``settings``,
-    to the points at which ``field``, placed in the scene by ``to_world``, is evaluated."""
+    to the points at which the field ``placed`` in the scene is evaluated."""
 
-    field: AnyGazeField
-    to_world: Similarity
+    placed: GazeFieldInstance
     geometry: SceneGeometry
     center: Point3f
     settings: ObserverSettings
@@ -193,10 +192,10 @@ class ObserverTracer:
         """
         mi = variant_types()
         width = dr.width(directions)
-        if not self.field.config.needs_surfaces:
+        if not self.placed.field.config.needs_surfaces:
             return dr.ones(mi.Float, width), dr.full(mi.Bool, False, width)
         has_surface, depth = self.trace_surfaces(directions, self.miss_distance(directions))
-        if self.field.config.fills_escaped:
+        if self.placed.field.config.fills_escaped:
             escaped = ~np.array(has_surface)
             if escaped.any():
                 depth = np.array(depth)
@@ -226,7 +225,7 @@ class ObserverTracer:
 
     def miss_distance(self, directions: Vector3f) -> Float:
         """End of a ray without a surface: on the bounding box of the gaze field, or at a distance of its diagonal."""
-        box, local = self.field.box, self.to_world
+        box, local = self.placed.field.box, self.placed.to_world
         o, d = local.point_to_local(self.center), local.vector_to_local(directions)
         near, far = intersect_box(o, d, box.lower, box.upper)
         return dr.select((near < far) & (far > 0) & dr.isfinite(far), far, box.diagonal * local.scale)
@@ -266,16 +265,12 @@ MAX_DIFFERENCE_DIRECTIONS = 1 << 15
 class GazeFieldInstance:
     """``field`` placed in the scene by ``to_world`` (field to scene); both are fixed."""
 
-    def __init__(self, field: AnyGazeField, to_world: Similarity | None = None):
+    def __init__(self, field: GazeNetwork, to_world: Similarity | None = None):
         self.field, self.to_world = field, to_world or Similarity()
 
     def parameters(self) -> list:
         """Arrays that gaze depends on, for derivatives."""
         return list(self.field.parameters().values())
-
-    def make_tracer(self, geometry: SceneGeometry, center: Point3f, settings: ObserverSettings) -> ObserverTracer:
-        """A tracer of the rays of the observer at ``center`` (one lane)."""
-        return ObserverTracer(self.field, self.to_world, geometry, center, settings)
 
     def for_observers(
         self,
@@ -321,16 +316,14 @@ class GazeFieldInstance:
                 entries = cache.get_or_compute_scalar((self, "integral", member), samples, of_member, integral.detached)
             integrals.append([integral.moving(k, p_o) for k, p_o in zip(entries, observers)])
         hits = []
-        if self.field.hits is not None:
-            hits = cache.get_or_compute_each((self, "hits"), observers, self.field.hits, self._observe_hits)
-        return ObservedGaze(self, geometry, settings, integrals, hits)
+        if (reaimed := self.field.hits) is not None:
 
-    def _observe_hits(self, center: Point3f) -> ObservedHits:
-        """The density of re-aimed hits for the observer at ``center``."""
-        hits = self.field.hits
-        assert hits is not None
-        position = np.array(self.to_world.point_to_local(center), np.float64).ravel()
-        return hits.observe(position, namespace(center.x))
+            def observe(center: Point3f) -> ObservedHits:
+                position = np.array(self.to_world.point_to_local(center), np.float64).ravel()
+                return reaimed.observe(position, namespace(center.x))
+
+            hits = cache.get_or_compute_each((self, "hits"), observers, reaimed, observe)
+        return ObservedGaze(self, geometry, settings, integrals, hits)
 
     def unnormalized(
         self,
@@ -413,7 +406,7 @@ class _SphereIntegral:
         return integrate_sphere(eval_in_order, self.settings.directions, self.settings.integral_tolerance)
 
     def _around(self, entry: CacheEntry, count: int) -> SphereSamples:
-        return entry.value.get(count, self.placed.make_tracer(self.geometry, entry.center, self.settings))
+        return entry.value.get(count, ObserverTracer(self.placed, self.geometry, entry.center, self.settings))
 
     def _integrand(self, entry: CacheEntry, samples: SphereSamples) -> Float:
         o = entry.center + dr.zeros(type(entry.center), dr.width(samples.directions))
@@ -439,7 +432,7 @@ class ObservedGaze:
         self._hits = list(hits)
 
     @property
-    def field(self) -> AnyGazeField:
+    def field(self) -> GazeNetwork:
         return self._instance.field
 
     def parameters(self) -> list:
@@ -522,9 +515,8 @@ class ObservedGaze:
         if not self._instance.field.config.needs_surfaces:
             with dr.suspend_grad():
                 center = variant_types().Point3f(dr.detach(p_o))
-                has_surface, distance = self._instance.make_tracer(
-                    self._geometry, center, self._settings
-                ).trace_surfaces(r_o)
+                tracer = ObserverTracer(self._instance, self._geometry, center, self._settings)
+                has_surface, distance = tracer.trace_surfaces(r_o)
                 escaped = ~has_surface
         return gaze, dr.select(escaped, dr.inf, distance)
 
@@ -537,9 +529,8 @@ class ObservedGaze:
             center = mi.Point3f(dr.detach(p_o))
             dr.make_opaque(center)
             width = dr.width(r_o)
-            distance, escaped = self._instance.make_tracer(self._geometry, center, self._settings).trace_distances(
-                r_o, miss_depths
-            )
+            tracer = ObserverTracer(self._instance, self._geometry, center, self._settings)
+            distance, escaped = tracer.trace_distances(r_o, miss_depths)
             o = center + dr.zeros(mi.Point3f, width)
             all_lanes = dr.full(mi.Bool, True, width)
             values = self._each(o + r_o * distance, o, r_o, all_lanes, None, escaped)

@@ -1,4 +1,4 @@
-"""Occlusion of surfaces from an observer: depth maps around the observer, and tracing towards single points."""
+"""Occlusion of surfaces from an observer: visibility, depth maps around the observer, and tracing towards points."""
 
 from __future__ import annotations
 
@@ -13,8 +13,36 @@ from nerg_mi.maths.types import Bool, Float, Point3f, Ray3f, Vector3f, variant_t
 from .depth import DEPTHS
 from .geometry import RayHit, SceneGeometry, shape_corners
 from .march_primal import OcclusionQuery
-from .observer import ObserverCache, ObserverSettings, distance_and_direction, fingerprint_geometry, visibility
+from .observer import ObserverCache, ObserverSettings, distance_and_direction, fingerprint_geometry
 from .observer_gaze import ObservedGaze
+
+# ---- Visibility ----
+#
+# Whether an observer sees a point: the shadow factor of the paper, with its sign corrected.
+#
+# The section "Surface Visibility and Gaze Occlusion" of the paper compares the depth d_o of the surface along the
+# observer's ray with the distance d_o* to the point. s = clip((d_o* - d_o - tol) / d_f, 0, 1) is 1 if a surface lies in
+# between; gaze is multiplied by the visibility 1 - s. (The paper multiplies by s, which would show gaze only where it
+# is hidden.)
+
+
+def visibility(d_expected: Float, d_observed: Float, falloff: Float, tolerance: Float | float) -> Float:
+    """Visibility of a point: 1 visible, 0 hidden.
+
+    Parameters
+    ----------
+    d_expected, d_observed : Float
+        d_o*, the distance to the point, and d_o, the depth of the surface along the observer's ray; in scene units.
+    falloff : Float
+        d_f >= 0, in scene units; 0: a step function.
+    tolerance : Float or float
+        How much nearer than the point its own surface can be, in scene units.
+    """
+    excess = d_expected - d_observed - tolerance
+    sharp = falloff <= 0
+    soft = dr.clip(excess / dr.select(sharp, 1, falloff), 0, 1)
+    return 1 - dr.select(sharp, dr.select(excess > 0, 1.0, 0.0), soft)
+
 
 # ---- Depth map around an observer ----
 #
@@ -116,7 +144,7 @@ class ObserverDepthMap:
 # ---- Tracing from an observer who is not at the camera ----
 #
 # The second depth pass of the paper: a ray from the observer to the camera's surface point p_d is traced for its own
-# depth d_o, which is compared with the distance d_o* (see `observer.visibility`).
+# depth d_o, which is compared with the distance d_o* (see `visibility`).
 
 
 # An entry of a map sees the surface of a point if it lies at most this multiple of the point's offset behind it.
@@ -190,7 +218,7 @@ def trace_from_observer(
     density = None
 
     if settings.visibility == "map":
-        depth_map, table = _depth_map_for(geometry, p_o, settings, gaze, cache or ObserverCache())
+        depth_map, table = _get_depth_map(geometry, p_o, settings, gaze, cache or ObserverCache())
         observed_depth, visible = depth_map.eval_visibility(r_o, distance, falloff, tolerance, active)
         if table is not None:
             # Of the surface itself: the target in front of it lies in another direction.
@@ -210,7 +238,7 @@ def trace_from_observer(
             clear_distance = distance - tolerance
             occlusion = OcclusionQuery(clear_distance, clear_distance - falloff, settings.surface_opacity)
         ray_hit = geometry.trace(to_point, active, settings.march, count=count, occlusion=occlusion)
-        observed_depth = _observed_depth(ray_hit, settings, active)
+        observed_depth = _find_observed_depth(ray_hit, settings, active)
         visible, evals = visibility(distance, observed_depth, falloff, tolerance), _evaluations(ray_hit)
     # An observer without a surface in front of the point sees the point itself.
     blocked = observed_depth < distance - tolerance
@@ -218,7 +246,7 @@ def trace_from_observer(
     return ObserverHit(dr.select(blocked, p_o + r_o * d_o, p_d), d_o, visible, evals, density)
 
 
-def _observed_depth(ray_hit: RayHit, settings: ObserverSettings, active: Bool) -> Float:
+def _find_observed_depth(ray_hit: RayHit, settings: ObserverSettings, active: Bool) -> Float:
     """Depth of the surface on the observer's rays; infinite without one, or if it is known to lie behind the point."""
     march = ray_hit.march
     if march is None or march.decided is None:
@@ -257,7 +285,7 @@ def shape_tolerance(geometry: SceneGeometry, settings: ObserverSettings, shape: 
     return RELATIVE_TOLERANCE * min(diagonal, near) + _FAR * diagonal
 
 
-def _depth_map_for(
+def _get_depth_map(
     geometry: SceneGeometry, p_o: Point3f, settings: ObserverSettings, gaze: ObservedGaze | None, cache: ObserverCache
 ) -> tuple[ObserverDepthMap, Float | None]:
     """The observer's depth map, and the table of ``gaze`` for it (None without gaze, or if it carries gradients)."""

@@ -12,18 +12,19 @@ from typing import Any
 
 import numpy as np
 
+from nerg_mi.aoi.areas import format_areas
+from nerg_mi.environment.scene_loading import list_scene_files
 from nerg_mi.errors import NergError, clean_text, format_error
 from nerg_mi.figures.style import Provenance, make_provenance
 from nerg_mi.files.images import encode_png
-from nerg_mi.formats.areas import MAX_AREAS, Region, format_areas
-from nerg_mi.rendering.scene import list_scene_files
+from nerg_mi.formats.boxes import MAX_AREAS, Region
 
 from . import layers
 from .layers import Scale
 from .page import BrowserWindow, Page
 from .points import PinholeView, make_heading
 from .scene import copy_view
-from .session import AttentionShare
+from .shares import AttentionShare
 
 # ---- Panel ----
 
@@ -463,8 +464,10 @@ class AreasPanel:
 
         @save.on_click
         def _(event: Any) -> None:
-            text = format_areas(self.session.regions, self.session.other_areas).encode()
-            event.client.send_file_download("areas.json", text, save_immediately=True)
+            with notify_errors(event.client, "Areas"):
+                areas = [*self.session.regions, *self.session.other_areas]
+                text = format_areas(areas, self.session.settings.areas.folder).encode()
+                event.client.send_file_download("areas.json", text, save_immediately=True)
 
         self._draw_boxes()
 

@@ -8,7 +8,7 @@ from html import escape
 
 import numpy as np
 
-from nerg_mi.api.scene import COLOR, Scene
+from nerg_mi.environment.scene import COLOR, Scene
 from nerg_mi.errors import NergError
 from nerg_mi.figures.overlay import (
     Overlay,
@@ -217,7 +217,7 @@ def colorize(
         pixels = srgb(color)
     else:
         inputs = OverlayLayers(color, np.asarray(values).reshape(rows), mask)
-        pixels = layer.overlay.paint(inputs, (scale.low, scale.high), Style(scale.colors))
+        pixels = layer.overlay.paint(inputs, (scale.low, scale.high), Style(cmap=scale.colors))
     if hatched and len(shape) == 2 and layer.overlay is not None:
         pixels = hatch(pixels, ~mask)
     return to_bytes(pixels).reshape(*shape, 3)

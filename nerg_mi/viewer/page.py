@@ -350,7 +350,7 @@ class Page:
 
         assert window.view is not None
         session, origin = self.session, window.view.origin
-        width, min_width = session.options.width, 0
+        width, min_width = session.settings.width, 0
         if window.frame_version == version and window.last_picture is not None:
             min_width = window.last_picture[1].shape[1]
         session.refine_picture(client.client_id, window.view, deliver, width, session.spp, min_width)

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.api.arrays import Camera
-from nerg_mi.api.query import observe, trace
-from nerg_mi.api.scene import Scene
+from nerg_mi.environment.arrays import Camera
+from nerg_mi.environment.queries import observe, trace
+from nerg_mi.environment.scene import Scene
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.progress import SILENT
 from nerg_mi.transport.geometry import Ceiling
@@ -150,7 +150,7 @@ def get_observer_forward(scene: Scene) -> np.ndarray:
 #
 # A picture is rendered at low resolution, then at full resolution, then with more samples per pixel. The refinement is
 # a generator, so that it can stop after each band of rays. The values are those of the integrator `nerg`
-# (`nerg_mi.api.query.trace`).
+# (`nerg_mi.environment.queries.trace`).
 
 BAND_SECONDS = 0.35
 """Target for the longest time of a band of rays, in seconds: a more urgent task waits this long."""
@@ -311,7 +311,7 @@ def refine(
     observer : ndarray of shape (3,) or None
         Position of the observer in scene units. None: the observer is at the camera.
     quantities : sequence of str
-        The quantities to compute, as for `nerg_mi.api.query.trace`.
+        The quantities to compute, as for `nerg_mi.environment.queries.trace`.
     width : int
         Width of the final picture in pixels.
     spp : int

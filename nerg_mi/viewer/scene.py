@@ -13,15 +13,16 @@ from xml.etree.ElementTree import Element, SubElement
 import matplotlib
 import numpy as np
 
-from nerg_mi.api.query import trace
+from nerg_mi.environment.nested_scene import make_paths_absolute, read_scene_elements, to_verbatim
+from nerg_mi.environment.queries import trace
+from nerg_mi.environment.scene_writer import Comment, element, format_document, format_numbers, prop
 from nerg_mi.errors import NergError
-from nerg_mi.rendering.nested_scene import make_paths_absolute, read_scene_elements, to_verbatim
-from nerg_mi.rendering.scene_writer import Comment, element, format_document, format_numbers, prop
 
 from . import layers
 from .page import Page
 from .points import PinholeView, make_heading
-from .session import ALL_PARTICIPANTS, LOW_PRIORITY, MAX_RAYS, Tracks
+from .session import LOW_PRIORITY
+from .tracks import ALL_PARTICIPANTS, MAX_RAYS, Tracks
 
 # ---- Scene files of a view ----
 
@@ -169,7 +170,7 @@ def copy_view(session: Any, view: PinholeView) -> str:
         )
     aovs = tuple(name for name in layers.required_quantities(session.display.layer) if name != "color")
     ceiling = None if session.ceiling is None else (session.ceiling, session.ceiling_up)
-    settings = session.options.width, session.spp, session.falloff, ceiling
+    settings = session.settings.width, session.spp, session.falloff, ceiling
     return copy_scene(session.scene_file, ViewSettings(view, session.observer, aovs, *settings))
 
 

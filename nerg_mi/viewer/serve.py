@@ -3,104 +3,27 @@
 from __future__ import annotations
 
 import atexit
-import os
 import tempfile
 import threading
-from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
+from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
-from nerg_mi.api.calls import Progress, report_progress
-from nerg_mi.api.gaze import list_inputs
-from nerg_mi.api.objects import as_file, build_options
+from nerg_mi.aoi.areas import AnyAreas, Areas
+from nerg_mi.environment.scene_loading import activate_mitsuba, activate_variant
 from nerg_mi.files.html import element
-from nerg_mi.progress import SILENT, Reporter
-from nerg_mi.workflows.scene_commands import ViewOptions
-from nerg_mi.workflows.view import make_viewer_scene
+from nerg_mi.files.values import FilePath
+from nerg_mi.formats.alignments import AnySimilarity
+from nerg_mi.progress import Progress, is_notebook, open_reporter
+from nerg_mi.ranges import COORDINATES, SPP, Range, check_ranges
 
 from .controls import AreasPanel, Controls
 from .page import Page
 from .scene import ParticipantsPanel
 from .server import RequestGuard, is_loopback, make_token, require_viser, start_server
-from .session import Session
-
-
-@dataclass(frozen=True)
-class RunningViewer:
-    """A running viewer.
-
-    Parameters
-    ----------
-    address : str
-        URL to open in a browser.
-    page : Page
-        Its page.
-    is_embeddable : bool
-        Whether pages of this machine, such as a notebook, may contain the page.
-    """
-
-    address: str
-    page: Page
-    is_embeddable: bool
-
-
-@contextmanager
-def open_viewer(
-    files: Sequence[str | Path],
-    options: ViewOptions | None = None,
-    reporter: Reporter = SILENT,
-    is_embeddable: bool = False,
-) -> Iterator[RunningViewer]:
-    """Serve ``files`` as a page for the duration of the block.
-
-    Parameters
-    ----------
-    files : sequence of str or Path
-        Files that `nerg_mi.workflows.view` can display.
-    options : ViewOptions, optional
-        Options of ``nerg view``. By default the server accepts connections from this machine only; with another host
-        the address contains a token.
-    reporter : Reporter
-        Receives progress and messages.
-    is_embeddable : bool
-        Whether pages of this machine, such as a notebook, may contain the page. Only without a token, whose cookie a
-        browser would not send from within another page.
-
-    Yields
-    ------
-    RunningViewer
-        The address and the page.
-
-    Raises
-    ------
-    NergError
-        The files cannot be displayed, the port is in use, or viser is not installed.
-    """
-    options = options or ViewOptions()
-    require_viser()
-    token = None if is_loopback(options.host) else make_token()
-    guard = RequestGuard(options.host, token, options.hostnames, is_embeddable and token is None)
-    with tempfile.TemporaryDirectory() as folder:
-        server = start_server(guard, options.port, "nerg view")
-        page = Page(server)
-        try:
-            session = Session(lambda: make_viewer_scene(files, Path(folder), options, reporter), options, page)
-            page.session = session
-            session.start()
-            page.open(session)
-            Controls(page)
-            if session.tracks is not None:
-                ParticipantsPanel(page, session.tracks)
-            if session.scene.has_gaze:
-                AreasPanel(page)
-            host = "localhost" if options.host in ("0.0.0.0", "::") else options.host
-            host = f"[{host}]" if ":" in host else host
-            query = "" if token is None else f"?token={token}"
-            yield RunningViewer(f"http://{host}:{server.get_port()}/{query}", page, guard.is_embeddable)
-        finally:
-            page.close()
+from .session import Session, SessionSettings
+from .source import ViewerScene, open_viewer_scene
 
 
 class Viewer:
@@ -110,23 +33,31 @@ class Viewer:
     ----------
     address : str
         URL to open in a browser.
+    page : Page
+        Its page.
     """
 
     HEIGHT = 600
     """Height of the viewer in a notebook in CSS pixels."""
 
-    def __init__(self, running: AbstractContextManager[RunningViewer]) -> None:
-        self._running = running
-        opened = running.__enter__()
-        self.address, self._is_embeddable = opened.address, opened.is_embeddable
+    def __init__(self, address: str, page: Page, is_embeddable: bool, resources: ExitStack) -> None:
+        self.address, self.page = address, page
+        self._is_embeddable, self._resources, self._is_closed = is_embeddable, resources, False
         atexit.register(self.close)
 
     def close(self) -> None:
         """Stop serving the page."""
         atexit.unregister(self.close)
-        running, self._running = self._running, None
-        if running is not None:
-            running.__exit__(None, None, None)
+        self._is_closed = True
+        self._resources.close()
+
+    def wait(self) -> None:
+        """Serve the page until Ctrl-C."""
+        try:
+            while True:
+                threading.Event().wait(3600)
+        except KeyboardInterrupt:
+            self.close()
 
     def __enter__(self) -> Viewer:
         return self
@@ -135,31 +66,65 @@ class Viewer:
         self.close()
 
     def __repr__(self) -> str:
-        return f"<Viewer: {'closed' if self._running is None else self.address}>"
+        return f"<Viewer: {'closed' if self._is_closed else self.address}>"
 
     def _repr_html_(self) -> str:
         link = element("a", f"Viewer at {self.address}", href=self.address, target="_blank", rel="noopener")
-        if self._running is None or not self._is_embeddable:
+        if self._is_closed or not self._is_embeddable:
             return link
         style = f"width: 100%; height: {self.HEIGHT}px; border: 0"
         return element("div", link, element("iframe", src=self.address, style=style))
 
 
-def view(inputs: object, *, options: ViewOptions | None = None, progress: Progress = None, **overrides: Any) -> Viewer:
+@check_ranges
+def view(
+    inputs: object | Sequence[object | FilePath],
+    *,
+    observer: Annotated[Sequence[float], COORDINATES] | None = None,
+    up: Annotated[Sequence[float], COORDINATES] | None = None,
+    areas: FilePath | AnyAreas | None = None,
+    align: AnySimilarity | FilePath | None = None,
+    width: Annotated[int, Range(16, 8192)] = 720,
+    spp: Annotated[int, Range(0, SPP.high)] = 0,
+    compile: bool = True,
+    host: str = "127.0.0.1",
+    port: Annotated[int, Range(0, 65535)] = 8080,
+    hostnames: Sequence[str] = (),
+    progress: Progress = None,
+) -> Viewer:
     """Show a scene with its gaze in the browser, with a movable observer.
 
-    The page is served in the background, to this machine only unless ``host`` is set.
+    The page is served in the background, to this machine only, and loads nothing from other servers. With another host,
+    its address contains a token.
 
     Parameters
     ----------
-    inputs : object or sequence of these
-        A scene, or an environment, a gaze field and recordings, in memory or as files, in any order.
-    options : ViewOptions, optional
-        Base options (`nerg_mi.workflows.scene_commands.ViewOptions`).
+    inputs : object, path or sequence of these
+        A scene (.xml), or a radiance field, splats, mesh or .vol, a gaze field and rays, in any order; or their folder.
+    observer : sequence of float, optional
+        Initial position of the observer's eye, x,y,z. Default: as in the scene file.
+    up : sequence of float, optional
+        Up direction of the scene, x,y,z. Default: as its files state, else 0,0,1.
+    areas : Areas, path or mapping, optional
+        JSON file of areas of interest (AOIs): boxes with names.
+    align : Alignment, Similarity, array_like or path, optional
+        JSON file with the 4x4 similarity from the frame of the rays to that of the scene, as nerg align writes it.
+        Default: the alignment of the gaze field.
+    width : int
+        Width of a refined image in pixels.
+    spp : int
+        Samples per pixel; 0: as in the scene file.
+    compile : bool
+        Compile the radiance field in the background, for faster pictures, and keep the result next to it as
+        NAME.compiled.safetensors for the next time.
+    host : str
+        Address to serve at. With an address other than the loopback address, the page needs a token.
+    port : int
+        Port to serve at; 0: any free port.
+    hostnames : sequence of str
+        Further host name under which the page may be requested.
     progress : bool, Reporter or None
-        None shows a progress bar in notebooks, True shows one anywhere, False none; a `Reporter` receives everything.
-    **overrides
-        Single options on top of ``options``, such as ``port=0`` or ``observer=(4.4, 2.8, 1.6)``.
+        Progress and messages (`nerg_mi.progress.Progress`).
 
     Returns
     -------
@@ -180,44 +145,38 @@ def view(inputs: object, *, options: ViewOptions | None = None, progress: Progre
     ...     viewer.address.startswith("http://127.0.0.1:")
     True
     """
-    with report_progress(progress) as reporter:
-        resolved = build_options(ViewOptions, "view", options, overrides)
-        paths = [as_file(item, "inputs") for item in list_inputs(inputs)]
-        return Viewer(open_viewer(paths, resolved, reporter, is_embeddable=True))
+    require_viser()
+    token = None if is_loopback(host) else make_token()
+    # A browser would not send the cookie of a token from within another page.
+    guard = RequestGuard(host, token, tuple(hostnames), is_notebook() and token is None)
+    shown = Areas(()) if areas is None else Areas.open(areas)
+    settings = SessionSettings(width, spp, observer, shown, compile)
+    variant = activate_mitsuba().variant()
+    with open_reporter(progress) as reporter, ExitStack() as resources:
+        folder = Path(resources.enter_context(tempfile.TemporaryDirectory()))
 
+        def load() -> ViewerScene:
+            # On the render thread.
+            activate_variant(variant)
+            return open_viewer_scene(inputs, folder, observer=observer, up=up, align=align, reporter=reporter)
 
-def view_files(files: Sequence[str | Path], options: ViewOptions | None = None, reporter: Reporter = SILENT) -> None:
-    """Serve ``files`` until Ctrl-C. Arguments and errors as for `open_viewer`."""
-    options = options or ViewOptions()
-    if is_loopback(options.host):
-        lower_priority()
-    with open_viewer(files, options, reporter) as running:
-        if not is_loopback(options.host):
+        server = start_server(guard, port, "nerg view")
+        page = Page(server)
+        resources.callback(page.close)
+        session = page.session = Session(load, settings, page)
+        session.start()
+        page.open(session)
+        Controls(page)
+        if session.tracks is not None:
+            ParticipantsPanel(page, session.tracks)
+        if session.scene.has_gaze:
+            AreasPanel(page)
+        name = "localhost" if host in ("0.0.0.0", "::") else host
+        name = f"[{name}]" if ":" in name else name
+        address = f"http://{name}:{server.get_port()}/{'' if token is None else f'?token={token}'}"
+        if token is not None:
             reporter.warn(
                 "anyone who has the address can see the scene and move the observer; the connection is not encrypted"
             )
-        reporter.message(f"open {running.address}")
-        reporter.message("press Ctrl-C to stop the viewer")
-        if options.open:
-            import webbrowser
-
-            webbrowser.open(running.address)
-        try:
-            _wait()
-        except KeyboardInterrupt:
-            reporter.message("the viewer has stopped")
-
-
-def lower_priority() -> None:
-    """Lower the priority of this thread and its children, where the operating system supports it.
-
-    The browser also draws on this machine; without a graphics card, it would freeze while pictures are refined.
-    """
-    if hasattr(os, "nice"):
-        os.nice(10)
-
-
-def _wait() -> None:
-    """Block until Ctrl-C."""
-    while True:
-        threading.Event().wait(3600)
+        reporter.message(f"open {address}")
+        return Viewer(address, page, guard.is_embeddable, resources.pop_all())

@@ -1,37 +1,31 @@
-"""The state of the viewer: the scene, its observer, the recordings, and the thread that renders."""
+"""The state of the viewer that all browsers share: the scene, its observer, and the tasks that compute pictures."""
 
 from __future__ import annotations
 
-import itertools
 import threading
-from collections.abc import Callable, Generator, Hashable, Iterator, Mapping, Sequence
-from concurrent.futures import Future
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol
 
 import numpy as np
 
-from nerg_mi.api.query import compute_shares, make_shape_aois, trace
-from nerg_mi.api.scene import COLOR, Scene
+from nerg_mi.aoi.areas import Area, Areas
+from nerg_mi.aoi.attention import make_shape_aois
+from nerg_mi.aoi.placed import Aoi
+from nerg_mi.environment.arrays import check_point
+from nerg_mi.environment.nested_scene import FIELD_PROPERTY, find_field_file, replace_radiance_field
+from nerg_mi.environment.queries import trace
+from nerg_mi.environment.scene import COLOR, Scene
+from nerg_mi.environment.scene_loading import activate_mitsuba, load_scene
 from nerg_mi.errors import NergError, parameter, translate_mitsuba_errors
+from nerg_mi.figures.layers import describe_basis
 from nerg_mi.files.atomic import write_text
-from nerg_mi.formats.areas import AreaSet, Region, read_areas
-from nerg_mi.maths.geometry import Similarity
-from nerg_mi.measures.shares import COARSE, SummationRule
-from nerg_mi.measures.visits import MARGIN, Aoi, BoxAoi
-from nerg_mi.probes.probes import place_probes
+from nerg_mi.formats.boxes import Region
 from nerg_mi.progress import SILENT
 from nerg_mi.ranges import MAX_COORDINATE
-from nerg_mi.rays.rays import Rays
-from nerg_mi.rendering.nested_scene import FIELD_PROPERTY, find_field_file, replace_radiance_field
-from nerg_mi.rendering.scene import activate_mitsuba, load_scene
 from nerg_mi.transport.extrapolation import describe_extrapolation
 from nerg_mi.transport.geometry import Ceiling
-from nerg_mi.workflows.render import describe_basis
-from nerg_mi.workflows.scene_cameras import check_point
-from nerg_mi.workflows.scene_commands import ViewOptions
-from nerg_mi.workflows.view import ViewerScene
 
 from . import layers
 from .compilation import BackgroundCompilation, find_compiled_file, is_compiled, is_current
@@ -54,6 +48,10 @@ from .points import (
     refine,
     render_frame,
 )
+from .shares import AttentionShare, iter_attention_shares
+from .source import ViewerScene
+from .tracks import Tracks
+from .worker import Worker
 
 # ---- Listener ----
 
@@ -82,319 +80,8 @@ class Listener(Protocol):
         ...
 
 
-# ---- Attention shares ----
-
-SHAPES_PER_STEP = 16
-"""Maximum number of shapes whose attention shares are computed in one step."""
-
-PRELIMINARY_SHARE_RULE = SummationRule(rtol=1, atol=1)
-"""Accuracy of the first attention shares."""
-
-
-@dataclass(frozen=True)
-class AttentionShare:
-    """An attention ``share``, from 0 to 1, and the estimate of its maximum ``error``."""
-
-    share: float
-    error: float
-
-    @property
-    def is_final(self) -> bool:
-        """Whether the error is within the tolerance."""
-        return self.error <= COARSE.rtol * self.share + COARSE.atol
-
-
-def iter_attention_shares(
-    scene: Scene,
-    observer: np.ndarray,
-    regions: Sequence[Region],
-    shapes: Sequence[str],
-    shape_aois: Sequence[Aoi] | None = None,
-) -> Iterator[dict[str, AttentionShare]]:
-    """Compute the attention shares of areas and shapes in steps: first preliminary ones, then within `COARSE`.
-
-    Parameters
-    ----------
-    scene : Scene
-        The scene, with a gaze field.
-    observer : ndarray of shape (3,)
-        Position of the observer in scene units.
-    regions : sequence of Region
-        Areas of interest.
-    shapes : sequence of str
-        Ids of meshes, which are seen from both sides.
-    shape_aois : sequence of Aoi, optional
-        The result of `make_shape_aois` for ``shapes``.
-
-    Yields
-    ------
-    dict of str to AttentionShare
-        Shares of the observer's gaze by name.
-    """
-    areas = [(region.name, BoxAoi(region), MARGIN) for region in regions]
-    meshes = make_shape_aois(scene, shapes) if shape_aois is None else shape_aois
-    groups = [areas] if areas else []
-    groups += [
-        [(name, aoi, 0.0) for name, aoi in zip(shapes[a : a + SHAPES_PER_STEP], meshes[a : a + SHAPES_PER_STEP])]
-        for a in range(0, len(shapes), SHAPES_PER_STEP)
-    ]
-    position = np.asarray(observer, np.float32)[None]
-    for rule in (PRELIMINARY_SHARE_RULE, COARSE):
-        for group in groups:
-            shares = compute_shares(scene, [aoi for _, aoi, _ in group], position, margin=group[0][2], rule=rule)
-            yield {
-                name: AttentionShare(share, error)
-                for (name, *_), share, error in zip(group, shares.share[0].tolist(), shares.error[0].tolist())
-            }
-
-
-# ---- Recordings: paths and poses of participants ----
-
-MAX_VERTICES = 20_000
-"""Maximum number of vertices of all paths together."""
-
-MAX_GAP = 1.0
-"""Seconds without a gaze sample that interrupt a path; a participant stays visible this long after a sample."""
-
-MAX_RAYS = 1 << 11
-"""Maximum number of gaze rays to draw."""
-
-MAX_PROBES = 512
-"""Maximum number of probes to draw."""
-
-ALL_PARTICIPANTS = "all participants"
-
-
-@dataclass(frozen=True, eq=False)
-class ParticipantPose:
-    """The pose of a participant at a moment.
-
-    Parameters
-    ----------
-    participant : str
-        Name of the participant.
-    position : ndarray of shape (3,)
-        Position of the eye in scene units.
-    direction : ndarray of shape (3,)
-        Viewing direction, a unit vector in the frame of the scene.
-    """
-
-    participant: str
-    position: np.ndarray
-    direction: np.ndarray
-
-
-class Tracks:
-    """Recordings in the frame of the scene.
-
-    Parameters
-    ----------
-    rays : Rays
-        The recordings.
-    align : Similarity
-        Transform from the frame of the recordings to the frame of the scene.
-    """
-
-    def __init__(self, rays: Rays, align: Similarity):
-        order = np.lexsort((rays.t, rays.person))
-        self._rays = rays.select(order)
-        matrix = self._matrix = np.asarray(align.matrix, float)
-        rotation = matrix[:3, :3] / align.scale
-        self.origins = self._rays.origin @ matrix[:3, :3].T + matrix[:3, 3]
-        self.directions = self._rays.direction @ rotation.T
-
-    @property
-    def time_range(self) -> tuple[float, float]:
-        """Times of the first and the last gaze sample, in seconds."""
-        return (float(self._rays.t.min()), float(self._rays.t.max())) if len(self._rays) else (0.0, 0.0)
-
-    @property
-    def groups(self) -> list[str]:
-        """The names of the groups: all participants, and each cohort."""
-        return [ALL_PARTICIPANTS, *self._rays.cohorts]
-
-    @property
-    def participants(self) -> list[str]:
-        """Names of the participants who have gaze samples."""
-        return [self._rays.persons[k] for k in np.unique(self._rays.person)]
-
-    def segments(self, group: str = ALL_PARTICIPANTS) -> tuple[np.ndarray, np.ndarray]:
-        """Return line segments (S, 2, 3) of the paths of a group, and the index (S,) of the participant of each."""
-        rows = np.flatnonzero(self._group_mask(group))
-        rows = rows[:: max(len(rows) // MAX_VERTICES, 1)]
-        person, t = self._rays.person[rows], self._rays.t[rows]
-        step = max(np.median(np.diff(t)) if len(t) > 1 else 0.0, 0.0)
-        if len(rows) < 2:
-            return np.zeros((0, 2, 3), np.float32), person[:0]
-        is_joined = (np.diff(person) == 0) & (np.diff(t) <= max(MAX_GAP, 4 * step))
-        pairs = np.stack([self.origins[rows[:-1]], self.origins[rows[1:]]], axis=1)[is_joined]
-        return pairs.astype(np.float32), person[:-1][is_joined]
-
-    def poses_at(self, time: float, group: str = ALL_PARTICIPANTS) -> list[ParticipantPose]:
-        """Return the poses of the participants of a group who have a gaze sample within `MAX_GAP` of ``time``."""
-        near = np.flatnonzero(self._group_mask(group) & (np.abs(self._rays.t - time) <= MAX_GAP))
-        poses = []
-        for person in np.unique(self._rays.person[near]):
-            rows = near[self._rays.person[near] == person]
-            k = rows[np.argmin(np.abs(self._rays.t[rows] - time))]
-            poses.append(ParticipantPose(self._rays.persons[person], self.origins[k], self.directions[k]))
-        return poses
-
-    def sample(
-        self, group: str = ALL_PARTICIPANTS, max_rays: int = MAX_RAYS
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Sample gaze rays of a group, evenly in time.
-
-        Parameters
-        ----------
-        group : str
-            A name of `groups`.
-        max_rays : int
-            Maximum number of rays.
-
-        Returns
-        -------
-        tuple of ndarray
-            Origins (K, 3) in scene units, unit directions (K, 3), and the index (K,) of the participant of each ray.
-        """
-        rows = np.flatnonzero(self._group_mask(group))
-        rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), max_rays)).astype(int)] if len(rows) else rows
-        return self.origins[rows], self.directions[rows], self._rays.person[rows]
-
-    def place_probes(self, group: str = ALL_PARTICIPANTS) -> tuple[np.ndarray, np.ndarray]:
-        """Place the probes that a kernel density of a group's gaze would have by default.
-
-        Returns
-        -------
-        tuple of ndarray
-            Positions (P, 3) in scene units, and the number of gaze samples of each probe (P,).
-
-        Raises
-        ------
-        NergError
-            No position has enough gaze samples.
-        """
-        rows = np.flatnonzero(self._group_mask(group))
-        probes = place_probes(self._rays.select(rows), count=MAX_PROBES)
-        linear, shift = self._matrix[:3, :3], self._matrix[:3, 3]
-        return probes.positions @ linear.T + shift, probes.counts
-
-    def _group_mask(self, group: str) -> np.ndarray:
-        if group == ALL_PARTICIPANTS or self._rays.cohort is None:
-            return np.ones(len(self._rays), bool)
-        return self._rays.cohort == self._rays.cohorts.index(group)
-
-
-# ---- Render thread ----
-#
-# Dr.Jit is used from one thread at a time. A task is a generator with short steps. Between two steps, a task of higher
-# priority can run. A new task replaces a task of the same name, which then does not continue: this cancels a picture
-# when the view moves.
-
-Result = TypeVar("Result")
-Task = Generator[Any, None, None] | Iterator[Any]
-
-
-class Worker:
-    """A thread that runs tasks. An exception ends its task only and is passed to ``on_error(error)``."""
-
-    def __init__(self, on_error: Callable[[BaseException], None]):
-        self._on_error = on_error
-        self._tasks: dict[Hashable, tuple[int, int, Task]] = {}
-        self._changed = threading.Condition()
-        self._counter = itertools.count()
-        self._is_stopped = False
-        self._thread = threading.Thread(target=self._run, name="nerg-view-render", daemon=True)
-        self._thread.start()
-
-    def submit(self, name: Hashable, priority: int, task: Task) -> None:
-        """Run ``task``, replacing a task of the same ``name``.
-
-        Tasks with a smaller ``priority`` value run first; tasks of equal priority take turns.
-        """
-        with self._changed:
-            if not self._is_stopped:
-                self._tasks[name] = priority, next(self._counter), task
-                self._changed.notify_all()
-
-    def cancel(self, name: Hashable) -> None:
-        """Cancel the task ``name`` if it exists."""
-        with self._changed:
-            self._tasks.pop(name, None)
-            self._changed.notify_all()
-
-    def call(self, function: Callable[[], Result]) -> Future[Result]:
-        """Call ``function`` on the thread before the next step of any task, and return a future of its result."""
-        future: Future[Result] = Future()
-
-        def steps() -> Iterator[None]:
-            try:
-                future.set_result(function())
-            except BaseException as error:
-                future.set_exception(error)
-            yield
-
-        self.submit(object(), -1, steps())
-        return future
-
-    @property
-    def task_names(self) -> list[Hashable]:
-        """Names of the unfinished tasks."""
-        with self._changed:
-            return list(self._tasks)
-
-    @property
-    def is_idle(self) -> bool:
-        """Whether there are no unfinished tasks."""
-        with self._changed:
-            return not self._tasks
-
-    def wait_idle(self, timeout: float) -> bool:
-        """Wait at most ``timeout`` seconds until all tasks are finished; return whether they are."""
-        with self._changed:
-            return self._changed.wait_for(lambda: not self._tasks, timeout)
-
-    def stop(self, timeout: float = 30.0) -> None:
-        """Stop the thread after its current step."""
-        with self._changed:
-            self._is_stopped = True
-            self._tasks.clear()
-            self._changed.notify_all()
-        self._thread.join(timeout)
-
-    def _run(self) -> None:
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._is_stopped or self._tasks)
-                if self._is_stopped:
-                    return
-                name = min(self._tasks, key=lambda n: self._tasks[n][:2])
-                entry = self._tasks[name]
-            is_done = self._step(entry[2])
-            with self._changed:
-                # Another task may have replaced it during the step.
-                if self._tasks.get(name) is entry:
-                    if is_done:
-                        del self._tasks[name]
-                    else:
-                        self._tasks[name] = entry[0], next(self._counter), entry[2]
-                self._changed.notify_all()
-
-    def _step(self, task: Task) -> bool:
-        """Run one step of ``task`` and return whether the task is finished."""
-        try:
-            next(task)
-        except StopIteration:
-            return True
-        except BaseException as error:
-            self._on_error(error)
-            return True
-        return False
-
-
 # ---- Session ----
 #
-# The state that all browsers share: the scene, the observer, the displayed layer, and the tasks that compute them.
 # Mitsuba and Dr.Jit are used only on the thread of the `Worker`, which also calls the `Listener`.
 
 FRAME_PRIORITY = 0
@@ -422,21 +109,33 @@ _MAX_SPP = 256
 _MAX_SHAPES = 60
 
 
+@dataclass(frozen=True)
+class SessionSettings:
+    """Width and samples per pixel of refined images, initial position of the observer, areas of interest, and whether
+    the radiance field is compiled (`nerg_mi.viewer.serve.view`)."""
+
+    width: int = 720
+    spp: int = 0
+    observer: Sequence[float] | None = None
+    areas: Areas = field(default_factory=lambda: Areas(()))
+    compile: bool = True
+
+
 class Session:
     """A scene with its observer and display settings.
 
     Parameters
     ----------
     load_source : callable
-        Returns the scene to view (`nerg_mi.workflows.view`); called on the render thread.
-    options : ViewOptions
-        Options of `nerg view`.
+        Returns the scene to view; called on the render thread.
+    settings : SessionSettings
+        Settings of the viewer.
     listener : Listener
         Receives events.
     """
 
-    def __init__(self, load_source: Callable[[], ViewerScene], options: ViewOptions, listener: Listener):
-        self.options, self.listener = options, listener
+    def __init__(self, load_source: Callable[[], ViewerScene], settings: SessionSettings, listener: Listener):
+        self.settings, self.listener = settings, listener
         self._load_source = load_source
         self.worker = Worker(listener.on_error)
         self.lock = threading.RLock()
@@ -451,7 +150,7 @@ class Session:
         self.observer_note = ""
         self.ceiling: float | None = None
         self.regions: list[Region] = []
-        self.other_areas: list[dict[str, Any]] = []
+        self.other_areas: list[Area] = []
         self.band_pace, self.frame_pace = BandPace(), FramePace()
         # The compiled copy of the radiance field, and the process that makes it.
         self.compiled: Path | None = None
@@ -483,7 +182,7 @@ class Session:
 
     def _start_compilation(self) -> None:
         """Use the compiled copy of the radiance field; make it in the background if there is none."""
-        field = find_field_file(self.source.scene, FIELD_PROPERTY) if self.options.compile else None
+        field = find_field_file(self.source.scene, FIELD_PROPERTY) if self.settings.compile else None
         if field is None or field.suffix != ".safetensors" or is_compiled(field):
             return
         compiled = find_compiled_file(field, self.source.folder)
@@ -521,8 +220,8 @@ class Session:
                 "in Python a camera by make_scene"
             )
         self.home_view = PinholeView.from_sensor(sensors[0])
-        self.spp = min(self.options.spp or int(sensors[0].sampler().sample_count()), _MAX_SPP)
-        observer = check_point(self.options.observer, parameter("observer"))
+        self.spp = min(self.settings.spp or int(sensors[0].sampler().sample_count()), _MAX_SPP)
+        observer = check_point(self.settings.observer, parameter("observer"))
         scene_observer = self.scene.observer
         if observer is None:
             observer = self._default_observer() if scene_observer is None else np.asarray(scene_observer, float)
@@ -532,9 +231,10 @@ class Session:
         ceiling = self.scene.integrator.ceiling
         self.ceiling_up, self.ceiling = (self.source.up, None) if ceiling is None else (ceiling.up, ceiling.height)
         self.tracks = None if self.source.rays is None else Tracks(self.source.rays, self.source.align)
-        areas = read_areas(self.options.aois) if self.options.aois is not None else AreaSet(())
+        areas = self.settings.areas
         # Areas that are not boxes are not displayed, but are saved with the boxes.
-        self.regions, self.other_areas = areas.boxes, list(areas.non_boxes)
+        self.regions = areas.boxes
+        self.other_areas = [area for area in areas.areas if not isinstance(area, Region)]
         shapes = [shape.id() for shape in self.scene.mitsuba.shapes() if shape.is_mesh()]
         self.shapes = [name for name in shapes if name and not name.startswith("__")][:_MAX_SHAPES]
 
@@ -751,7 +451,7 @@ class Session:
 
     def choose_frame_width(self, view: PinholeView) -> int | None:
         """Return the width of frames of ``view`` during a movement; None if rendering is too slow for them."""
-        return self.frame_pace.choose_width(view, self.options.width)
+        return self.frame_pace.choose_width(view, self.settings.width)
 
     def render_frame(
         self,

@@ -4,3 +4,8 @@
 `views` render posed pictures with depth, `attention_law` defines the true gaze density of the shoppers in closed form,
 and `shoppers` simulates their walks. Frame: x east, y north, z up, metres.
 """
+
+from pathlib import Path
+
+SCENE_FILE = Path(__file__).resolve().with_name("scene.xml")
+"""The scene file, with the trained fields."""

@@ -56,14 +56,11 @@ def make_shoppers(job: Job) -> list[Path]:
 
 def make_field(job: Job) -> list[Path]:
     """Radiance field, trained on the pictures and their exact depth; the test views are held out."""
-    import mitsuba as mi
-
-    from nerg_mi.workflows.radiance_commands import RadianceOptions
-    from nerg_mi.workflows.train_radiance import train_radiance
+    from nerg_mi.train.radiance import train_radiance
 
     _require_file(job.build / "transforms.json", "views")
     path = job.build / "store.safetensors"
-    train_radiance(job.build, path, RadianceOptions(steps=6500, seed=job.seed, half=True, mode=mi.variant()))
+    train_radiance(job.build, steps=6500, seed=job.seed, half=True, output=path)
     # The preview and the state of the run stay in the build folder.
     return [path.replace(job.store / path.name)]
 
@@ -76,8 +73,8 @@ def make_rays(job: Job) -> list[Path]:
     """
     import numpy as np
 
-    from nerg_mi.rays.readers.registry import read_rays
-    from nerg_mi.rays.readers.skeleton import SkeletonOptions
+    from nerg_mi.tracking.readers.registry import read_rays
+    from nerg_mi.tracking.readers.skeleton import SkeletonOptions
 
     tracking, path = job.build / "shoppers.csv", job.build / "rays.npz"
     _require_file(tracking, "shoppers")
@@ -99,44 +96,38 @@ def make_gaze(job: Job) -> list[Path]:
 
     64 positions are held out and recorded in it.
     """
-    import mitsuba as mi
-
-    from nerg_mi.workflows.gaze_commands import GazeOptions
-    from nerg_mi.workflows.train_gaze import train_gaze
+    from nerg_mi.train.gaze import train_gaze
 
     source, field_path = job.build / "rays.npz", job.store / "store.safetensors"
     _require_file(source, "rays")
     _require_file(field_path, "field")
     path = job.store / "shoppers.safetensors"
-    options = GazeOptions(
-        field=field_path,
+    train_gaze(
+        source,
+        field_path,
         # Heads are sampled from the law at 5 Hz: rays are exact and independent, so more steps do not overfit.
         steps=640,
         test_zones=8,
         test_positions=64,
         seed=job.seed,
         half=True,
-        mode=mi.variant(),
+        output=path,
     )
-    train_gaze(source, path, options)
     return [path]
 
 
 def make_evaluation(job: Job) -> list[Path]:
     """Scores of the gaze field and of the baselines at the held-out positions."""
-    import mitsuba as mi
-
-    from nerg_mi.workflows.evaluate import evaluate_gaze
-    from nerg_mi.workflows.gaze_commands import GazeEvaluationOptions
-    from nerg_mi.workflows.report import RESULTS
+    from nerg_mi.evaluation.held_out import evaluate_gaze
+    from nerg_mi.reports.inputs import RESULTS
 
     source, gaze = job.build / "rays.npz", job.store / "shoppers.safetensors"
     _require_file(source, "rays")
     _require_file(gaze, "gaze")
-    options = GazeEvaluationOptions(field=job.store / "store.safetensors", pictures=0, seed=job.seed, mode=mi.variant())
-    evaluate_gaze(gaze, source, job.build / "shoppers.eval", options)
+    folder = job.build / "shoppers.eval"
+    evaluate_gaze(gaze, source, job.store / "store.safetensors", pictures=0, seed=job.seed, output=folder)
     path = job.store / RESULTS
-    return [(job.build / "shoppers.eval" / RESULTS).replace(path)]
+    return [(folder / RESULTS).replace(path)]
 
 
 def _require_file(path: Path, stage: str) -> None:

@@ -209,7 +209,7 @@ def simulate_shoppers(layout: StoreLayout, *, shoppers: int = 100, stops=(8, 20)
 
 def write_shoppers(layout: StoreLayout, path, *, log=print, **options) -> Path:
     """Write the shoppers of `simulate_shoppers` as a 22-keypoint skeleton file, with times in milliseconds."""
-    from nerg_mi.rays.readers.skeleton import keypoints_from_head, write_skeleton
+    from nerg_mi.tracking.readers.skeleton import keypoints_from_head, write_skeleton
 
     ids, times, origins, directions = simulate_shoppers(layout, **options)
     path = Path(path)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from nerg_mi.alignment.constraints import SceneTraces
-from nerg_mi.rays.rays import Rays
+from nerg_mi.tracking.rays import Rays
 
 BOXES = np.array([[(0.9, 0.7, 0), (1.7, 2.9, 1.2)], [(2.6, 0, 0), (4.0, 0.8, 2.0)]])
 """Solid blocks, lower and upper corners; the room is (0, 0, 0) to `SIZE`."""

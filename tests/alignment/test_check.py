@@ -7,9 +7,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from nerg_mi.alignment.check import Alignment, AlignmentCheck, check_alignment, read_similarity
-from nerg_mi.alignment.constraints import AlignmentFit, Interval
+from nerg_mi.alignment.check import AlignmentCheck, check_alignment, record_fit
+from nerg_mi.alignment.constraints import AlignmentFit
 from nerg_mi.errors import NergError
+from nerg_mi.formats.alignments import Interval, read_similarity
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.transport.geometry import SceneGeometry
 from nerg_mi.transport.volume_medium import VolumeMedium
@@ -77,7 +78,7 @@ def test_undetermined_alignments_are_reported_when_they_are_read(tmp_path):
     path, doubts = tmp_path / "alignment.json", []
     for turn in ((-4.0, 5.0), (-50.0, 130.0)):
         fit = AlignmentFit(np.eye(4), np.zeros(0), np.zeros(0), interval=Interval(turn, (1.0, 1.02), 0.4))
-        result = Alignment.from_fit("tracking", fit, {}, False)
+        result = record_fit("tracking", fit, {}, False)
         assert result.residuals["median_cm"] is None
         result.save(path)
         read_similarity(path, "--align", "rays to field", doubts.append)
@@ -104,7 +105,7 @@ def written(path):
         np.diag([1e-4] * 3 + [4e-4] * 3 + [1e-4]),
         metadata={"pairs": 5},
     )
-    result = Alignment.from_fit("pairs", fit, {"rays": {"file": "a.npz", "sha256": "00"}}, False)
+    result = record_fit("pairs", fit, {"rays": {"file": "a.npz", "sha256": "00"}}, False)
     result.save(path)
     return result
 

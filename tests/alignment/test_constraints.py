@@ -19,9 +19,10 @@ from nerg_mi.alignment.constraints import (
     surface_from_traces,
     trace_scene,
 )
-from nerg_mi.alignment.similarity import LocalSimilarity, fit_similarity, similarity_scale, turn_between
+from nerg_mi.alignment.similarity import LocalSimilarity, fit_similarity, turn_between
 from nerg_mi.errors import NergError
 from nerg_mi.formats.ply import write_columns
+from nerg_mi.maths.transforms import similarity_scale
 from tests.refusals import mentions
 
 from . import rooms

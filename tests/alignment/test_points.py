@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import nerg_mi as nerg
 from nerg_mi.alignment.constraints import AlignmentTarget
 from nerg_mi.alignment.points import Cameras, Pairs, mean_rotation, read_cameras, read_pairs
-from nerg_mi.alignment.similarity import MIRROR, residual_distances, similarity_scale
+from nerg_mi.alignment.similarity import MIRROR, residual_distances
 from nerg_mi.errors import NergError
+from nerg_mi.maths.transforms import similarity_scale
 
 from .rooms import carried, similarity
 
@@ -182,3 +184,15 @@ def test_empty_cells_are_refused(tmp_path):
     (tmp_path / "a.csv").write_text(HEAD + "a,1,2,3,4,5,\nb,0,0,0,0,0,0\nc,1,0,0,1,0,0\n")
     with pytest.raises(NergError, match="points in the frame"):
         read_pairs(tmp_path / "a.csv").fit(FREE, quiet)
+
+
+# ---- The operation ----
+
+ROWS = "0,0,0,1,0,0\n2,0,0,5,0,0\n0,1,0,1,2,0\n0,0,1,1,0,2\n"
+
+
+def test_files_may_be_named_by_strings(tmp_path):
+    (tmp_path / "p.csv").write_text("x,y,z,place_x,place_y,place_z\n" + ROWS)
+    result = nerg.align(output=str(tmp_path / "a.json"), pairs=str(tmp_path / "p.csv"))
+    np.testing.assert_allclose(result.matrix, json.loads((tmp_path / "a.json").read_text())["matrix"])
+    np.testing.assert_allclose(result.matrix[:3, :3], 2 * np.eye(3), atol=1e-12)

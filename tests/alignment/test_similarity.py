@@ -16,11 +16,11 @@ from nerg_mi.alignment.similarity import (
     leave_one_out_distances,
     residual_distances,
     right_jacobian,
-    similarity_scale,
     turn_between,
     vertical_rotation,
 )
 from nerg_mi.errors import NergError
+from nerg_mi.maths.transforms import similarity_scale
 
 from .rooms import carried, similarity
 

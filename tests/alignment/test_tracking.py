@@ -10,7 +10,7 @@ from nerg_mi.alignment.similarity import MIRROR, residual_distances
 from nerg_mi.alignment.tracking import DECLARED, Tracking, candidate_scales, compare_flips, is_close, search_placements
 from nerg_mi.errors import NergError
 from nerg_mi.photos.posed import read_semidense
-from nerg_mi.rays.readers.registry import read_rays
+from nerg_mi.tracking.readers.registry import read_rays
 from tests.alignment import rooms
 
 # ---- Flips ----

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.rays.rays import Rays
+from nerg_mi.tracking.rays import Rays
 
 SIGN = np.array([[4.0, 1.5, 1.0], [4.2, 2.5, 2.0]])
 STAND = np.array([[2.5, 1.0, 0.0], [2.9, 2.0, 2.2]])

@@ -7,13 +7,11 @@ import csv
 import pytest
 
 from nerg_mi.aoi import output
-from nerg_mi.aoi.options import StatisticsOptions
-from nerg_mi.aoi.output import StatisticsResult, write_results
-from nerg_mi.figures.statistics import aois_figure
+from nerg_mi.aoi.charts import aois_figure
+from nerg_mi.aoi.output import StatisticsResult
+from nerg_mi.aoi.tables import MIN_VIEWPOINTS, ParticipantRows
+from nerg_mi.aoi.visits import ALL, VisitSums
 from nerg_mi.figures.style import figure_of
-from nerg_mi.measures.tables import MIN_VIEWPOINTS, ParticipantRows
-from nerg_mi.measures.visits import ALL, VisitSums
-from tests.workflows.recorder import Recorder
 
 # ---- Results as a folder of files ----
 
@@ -30,21 +28,18 @@ ROW_OF_AOI = {
 
 
 def test_non_empty_tables_are_written(tmp_path):
-    recorder = Recorder()
-    made = StatisticsResult(aois=[ROW_OF_AOI], num_suppressed=2)
-    files = write_results(tmp_path, made, [], StatisticsOptions(), recorder)
+    files = StatisticsResult(aois=[ROW_OF_AOI], num_suppressed=2).save(tmp_path)
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted(p.name for p in files)
     names = {p.name for p in files}
     assert {"aois.csv", "aois.md", "aois.png", "suppressed.txt", "about.json"} <= names
     assert not any(name.startswith(("transitions", "what_if", "participants")) for name in names)
-    assert "2 values" in (tmp_path / "suppressed.txt").read_text() and recorder.messages
+    assert "2 values" in (tmp_path / "suppressed.txt").read_text()
 
 
 def test_equal_results_give_equal_files(tmp_path):
     made = StatisticsResult(aois=[ROW_OF_AOI])
     for name in "ab":
-        (tmp_path / name).mkdir()
-        write_results(tmp_path / name, made, [], StatisticsOptions(), Recorder())
+        made.save(tmp_path / name)
     for path in (tmp_path / "a").iterdir():
         assert path.read_bytes() == (tmp_path / "b" / path.name).read_bytes(), path.name
 

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
+from types import SimpleNamespace
 
-import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.aoi.measured import Viewpoints
-from nerg_mi.aoi.options import StatisticsOptions
+from nerg_mi.aoi.areas import AreaGroup, Areas
+from nerg_mi.aoi.changes import open_changes
+from nerg_mi.aoi.placed import open_placed_areas
 from nerg_mi.aoi.predicted import (
-    AoiScene,
     PredictedAttention,
+    Viewpoints,
     add_uncertainty,
     aggregate_by_participant,
-    load_aoi_scene,
     median_support,
     place_observers_on_floor,
     predict_attention,
@@ -26,25 +25,28 @@ from nerg_mi.aoi.predicted import (
     warn_missing_support,
     what_if_rows,
 )
-from nerg_mi.aoi.scene import Changes, GazeScene, NewShape, load_gaze_scene, make_aois
+from nerg_mi.aoi.settings import AoiSampling, ObserverGrid
+from nerg_mi.aoi.tables import MIN_VIEWPOINTS, MinParticipantsFilter
+from nerg_mi.aoi.visits import ALL, Cell
+from nerg_mi.environment.sampler import GazeSampler
 from nerg_mi.errors import NergError
-from nerg_mi.fields.mlp import namespace
-from nerg_mi.formats.areas import AreaSet, MeshPart, Region, read_areas
-from nerg_mi.maths.geometry import Similarity
-from nerg_mi.measures.tables import MIN_VIEWPOINTS, MinParticipantsFilter
-from nerg_mi.measures.visits import ALL, BoxAoi, Cell
+from nerg_mi.formats.boxes import Region
 from nerg_mi.progress import SILENT
 from nerg_mi.transport.geometry import SceneGeometry
 from tests.notes import find_wrong_notes
-from tests.workflows.recorder import Recorder
+from tests.recorder import Recorder
 
 from .place import write_place
 
 # ---- Predictions against sums over directions ----
 
 
-class Law(GazeScene):
+class Law(GazeSampler):
     """Gaze that is twice as dense ahead (x > 0) as behind, with a support of seven samples."""
+
+    def __init__(self):
+        gaze = SimpleNamespace(field=SimpleNamespace(basis=None))
+        super().__init__(gaze, SceneGeometry(None), None)
 
     def query_from(self, eye):
         return lambda d: (np.where(d[:, 0] > 0, 2.0, 1.0)[None], None)
@@ -52,8 +54,20 @@ class Law(GazeScene):
     def support_at(self, eye):
         return 7.0
 
+    def describe_extrapolation(self, observers):
+        return ""
 
-AROUND = Law(None, None, Similarity())
+
+AHEAD = Region.create("ahead", [1, -1, -1], [2, 1, 1])
+BEHIND = Region.create("behind", [-2, -1, -1], [-1, 1, 1])
+
+
+def predict(*areas, sampler=None, scale=1.0, directions=1 << 15):
+    """Predict the attention of `OBSERVERS` on ``areas``."""
+    placed = open_placed_areas(None, None, Areas(areas), np.diag([scale, scale, scale, 1]))
+    sampling = AoiSampling(margin=0.0, aoi_samples=24, directions=directions)
+    return predict_attention(replace(placed, sampler=sampler or Law(), sampling=sampling), OBSERVERS, 120.0)
+
 
 OBSERVERS = Viewpoints(
     np.array([[0.0, 0, 0], [0, 0, 0.2], [0, 0, 0]]),
@@ -65,11 +79,8 @@ OBSERVERS = Viewpoints(
 
 def test_shares_are_integrals():
     # A cube with a visible face of 2 x 2 at x = 1: a sixth of the sphere, and 2/3 of the gaze of the hemisphere.
-    aois = [
-        BoxAoi(Region.create("ahead", [1, -1, -1], [2, 1, 1])),
-        BoxAoi(Region.create("behind", [-2, -1, -1], [-1, 1, 1])),
-    ]
-    result = predict_attention(AROUND, OBSERVERS, aois, [(0,), (1,), (0, 1)], 0.0, 120.0, 24, 1 << 15, SILENT)
+    areas = AHEAD, BEHIND, AreaGroup("both", ("ahead", "behind"))
+    result = predict(*areas)
     assert np.allclose(result.share[0], [2 / 9, 1 / 9, 3 / 9], rtol=2e-3)
     # Mean distance to a square face over its solid angle, by quadrature in its plane.
     u = (np.arange(400) + 0.5) / 200 - 1
@@ -79,15 +90,13 @@ def test_shares_are_integrals():
     assert result.distance[0, 0] / result.share[0, 0] == pytest.approx(mean, rel=2e-3)
     assert result.visible.tolist() == [[True, False, True]] * 3 and result.support.tolist() == [7, 7, 7]
     # Distances are in metres, of which a scene of twice the size has half as many.
-    doubled = Law(None, None, Similarity(np.diag([2.0, 2, 2, 1])))
-    in_metres = predict_attention(doubled, OBSERVERS, aois, [(0,), (1,), (0, 1)], 0.0, 120.0, 24, 1 << 15, SILENT)
+    in_metres = predict(*areas, scale=2.0)
     np.testing.assert_allclose(in_metres.distance, result.distance / 2)
     np.testing.assert_allclose(in_metres.share, result.share)
 
 
 def test_prediction_is_aggregated_by_participant():
-    aois = [BoxAoi(Region.create("ahead", [1, -1, -1], [2, 1, 1]))]
-    result = predict_attention(AROUND, OBSERVERS, aois, [(0,)], 0.0, 120.0, 24, 4096, SILENT)
+    result = predict(AHEAD, directions=4096)
     people = aggregate_by_participant(result, OBSERVERS, ALL, {"Ada": 3.0, "Bo": 6.0}, 0.3)
     assert people.names == ("Ada", "Bo")
     share = result.share[:2].mean(axis=0)
@@ -107,21 +116,11 @@ class Two(Law):
 
 
 def test_ensemble_members():
-    aois = [
-        BoxAoi(Region.create("ahead", [1, -1, -1], [2, 1, 1])),
-        BoxAoi(Region.create("behind", [-2, -1, -1], [-1, 1, 1])),
-    ]
-    result = predict_attention(
-        Two(None, None, Similarity()), OBSERVERS, aois, [(0,), (1,)], 0.0, 120.0, 24, 1 << 15, SILENT
-    )
+    result = predict(AHEAD, BEHIND, sampler=Two())
     # A sixth of the sphere each: equal for the mean, and 10/11 or 1/11 of a third of a hemisphere for one member.
     assert result.members.shape == (2, 3, 2) and np.allclose(result.share[0], 1 / 6, rtol=3e-3)
     assert np.allclose(result.members[:, 0], [[10 / 33, 1 / 33], [1 / 33, 10 / 33]], rtol=3e-3)
-    assert predict_attention(AROUND, OBSERVERS, aois, [(0,), (1,)], 0.0, 120.0, 24, 64, SILENT).members.shape == (
-        1,
-        3,
-        2,
-    )
+    assert predict(AHEAD, BEHIND, directions=64).members.shape == (1, 3, 2)
 
 
 def test_participants_are_subsampled():
@@ -147,53 +146,19 @@ def test_participants_are_subsampled():
 
 
 def test_observers_are_placed_on_the_floor(tmp_path):
-    around = load_gaze_scene(write_place(tmp_path, gaze=False), None, None, None, ns)
-    result = place_observers_on_floor(around, 1.6, 0.25, 0.0)
+    placed = open_placed_areas(write_place(tmp_path, gaze=False), None, Areas(()))
+    result = place_observers_on_floor(placed, ObserverGrid())
     inside = ((result[:, :2] > (2.5, 1.0)) & (result[:, :2] < (2.9, 2.0))).all(axis=1)
     assert 330 < len(result) < 24 * 16 and not inside.any() and np.allclose(result[:, 2], 1.6)
     with pytest.raises(NergError, match="floor"):
-        place_observers_on_floor(around, 1.6, 0.25, -2.0)
+        place_observers_on_floor(placed, ObserverGrid(floor_height=-2.0))
+    with pytest.raises(NergError, match="bounds of the scene"):
+        place_observers_on_floor(open_placed_areas(None, None, Areas(())), ObserverGrid())
 
 
 def test_observers_have_names():
     observers = viewpoints_at(np.zeros((12, 3)))
     assert observers.participants[0] == "observer 01" and len(set(observers.participants)) == 12
-
-
-# ---- AOI scene ----
-
-
-def setting(folder, scene=True, **options):
-    requested = StatisticsOptions(aois=folder / "areas.json", **options)
-    place = folder / "scene.xml" if scene else None
-    return load_aoi_scene(place, None, None, read_areas(folder / "areas.json"), requested, namespace("llvm_ad_rgb"))
-
-
-def test_cohorts_come_from_the_table_or_the_samples(tmp_path, rgb):
-    write_place(tmp_path)
-    (tmp_path / "who.csv").write_text("person,cohort\na,old\nb,new\n")
-    result = setting(tmp_path)
-    assert result.members == [(0,), (1,), (0, 1)] and result.margin == 0.03  # noqa: RUF069 (stored)
-    assert result.make_context(False, ("x",)).cohort_names == ("x",) and result.make_context(True, ()).use_hit_points
-    table = setting(tmp_path, cohorts=tmp_path / "who.csv").make_context(False, ("x",))
-    assert table.cohort_names == ("new", "old") and list(table.transition_areas) == [0, 1]
-
-
-def test_aois_occlude_each_other_without_geometry(tmp_path, rgb):
-    write_place(tmp_path)
-    areas = (
-        (tmp_path / "areas.json").read_text().replace('"shape": "stand"', '"min": [2.5, 1, 0], "max": [2.9, 2, 2.2]')
-    )
-    (tmp_path / "areas.json").write_text(areas)
-    result = setting(tmp_path, scene=False, aoi_visibility=True)
-    depth = result._trace_depth(np.array([[0.0, 1.6, 1.5], [0, 2.4, 1.5]]), np.array([[1.0, 0, 0]] * 2))
-    assert np.allclose(depth, (2.5, 4.0))
-
-
-def test_options_are_checked_before_loading(tmp_path, rgb):
-    write_place(tmp_path)
-    with pytest.raises(NergError, match="NAME=FROM,TO"):
-        setting(tmp_path, windows=("late",))
 
 
 # ---- Uncertainty ----
@@ -280,7 +245,7 @@ def test_few_viewpoints_are_reported():
 
 # ---- What-if table ----
 
-AREAS = AreaSet((Region.create("a", [0, 0, 0], [1, 1, 1]), Region.create("b", [2, 0, 0], [3, 1, 1])))
+AREAS = Areas((Region.create("a", [0, 0, 0], [1, 1, 1]), Region.create("b", [2, 0, 0], [3, 1, 1])))
 WHAT_IF_EYES = viewpoints_at(np.arange(15.0).reshape(5, 3))
 
 
@@ -291,8 +256,7 @@ def texts(share, support=5.0, members=1):
     return PredictedAttention(share, share, share > 0, np.full(len(share), support), each)
 
 
-def rows_what_if(tmp_path, changes, after, floor=None, members=1):
-    (tmp_path / "c.json").write_text(json.dumps(changes))
+def rows_what_if(changes, after, floor=None, members=1):
     requested = []
 
     def predict(expected, observers):
@@ -300,17 +264,16 @@ def rows_what_if(tmp_path, changes, after, floor=None, members=1):
         return after
 
     before = texts([[0.1, 0], [0.2, 0], [0.1, 0], [0.2, 0], [0.15, 0]], members=members)
-    around, aois = GazeScene(None, None, Similarity()), make_aois(AREAS.elements, {}, {})
-    setting = AoiScene(around, AREAS, aois, StatisticsOptions(), {})
+    placed = open_placed_areas(None, None, AREAS)
     result = what_if_rows(
-        tmp_path / "c.json", setting, WHAT_IF_EYES, before, predict, floor or MinParticipantsFilter(), 199, 0
+        open_changes(changes), placed, WHAT_IF_EYES, before, predict, floor or MinParticipantsFilter(), 199, 0
     )
     return {(r["aoi"], r["measure"]): r for r in result}, requested[0]
 
 
-def test_what_if_pairs_participants(tmp_path):
+def test_what_if_pairs_participants():
     after = texts([[0.2, 0.1], [0.3, 0.1], [0.21, 0.1], [0.29, 0.1], [0.25, 0.1]])
-    result, (observers, areas, aois) = rows_what_if(tmp_path, {"move": [{"area": "a", "by": [5, 0, 0]}]}, after)
+    result, (observers, areas, aois) = rows_what_if({"move": [{"area": "a", "by": [5, 0, 0]}]}, after)
     share = result["a", "share"]
     assert share["before"] == pytest.approx(0.15) and share["after"] == pytest.approx(0.25)
     assert share["difference"] == pytest.approx(0.1) and 0.08 < share["low"] < 0.1 < share["high"] < 0.12
@@ -319,56 +282,36 @@ def test_what_if_pairs_participants(tmp_path):
     assert areas.boxes[0].lower[0] == 5 and observers is WHAT_IF_EYES and len(aois) == 2
     assert not find_wrong_notes(result.values()) and "difference_spread" in share["note"]
     after = texts([[0.2, 0.1], [0.3, 0.1], [0.21, 0.1], [0.29, 0.1], [0.25, 0.1]], support=np.nan, members=2)
-    result, _ = rows_what_if(tmp_path, {"move": [{"area": "a", "by": [5, 0, 0]}]}, after, members=2)
+    result, _ = rows_what_if({"move": [{"area": "a", "by": [5, 0, 0]}]}, after, members=2)
     assert not find_wrong_notes(result.values()) and result["a", "share"]["difference_spread"] is not None
     assert "support" in result["a", "share"]["note"]
 
 
-def test_what_if_with_other_observers(tmp_path):
+def test_what_if_with_other_observers():
     after = texts([[0.5, 0.5]] * 2)
-    result, (observers, *_) = rows_what_if(tmp_path, {"observers": [[9, 9, 9], [8, 8, 8]], "shift": [0, 0, 1]}, after)
+    result, (observers, *_) = rows_what_if({"observers": [[9, 9, 9], [8, 8, 8]], "shift": [0, 0, 1]}, after)
     assert observers.positions.tolist() == [[9, 9, 10], [8, 8, 9]]
     assert result["a", "share"]["after"] == pytest.approx(0.5) and result["a", "share"]["before"] == pytest.approx(0.15)
 
 
-def test_what_if_suppresses_few_participants(tmp_path):
+def test_what_if_suppresses_few_participants():
     floor = MinParticipantsFilter(9)
-    result, _ = rows_what_if(tmp_path, {"shift": [0, 0, 1]}, texts([[0.2, 0.1]] * 5), floor)
+    result, _ = rows_what_if({"shift": [0, 0, 1]}, texts([[0.2, 0.1]] * 5), floor)
     assert all(r["before"] is None and r["difference"] is None for r in result.values()) and floor.num_suppressed == 4
     assert not find_wrong_notes(result.values())
 
 
-def test_what_if_spread_over_members(tmp_path):
+def test_what_if_spread_over_members():
     after = texts([[0.2, 0.1]] * 5, members=2)
-    result, _ = rows_what_if(tmp_path, {"shift": [0, 0, 1]}, after, members=2)
+    result, _ = rows_what_if({"shift": [0, 0, 1]}, after, members=2)
     # Equal changes of both members have no spread; a change of one member has.
     assert result["a", "share"]["difference_spread"] == pytest.approx(0, abs=1e-12)
     assert result["a", "visible"]["difference_spread"] is None
-    result, _ = rows_what_if(tmp_path, {"shift": [0, 0, 1]}, replace(after, members=after.members[[0, 0]]), members=2)
+    result, _ = rows_what_if({"shift": [0, 0, 1]}, replace(after, members=after.members[[0, 0]]), members=2)
     assert result["a", "share"]["difference_spread"] == pytest.approx(0.1 / 5 / np.sqrt(2))
-    assert (
-        rows_what_if(tmp_path, {"shift": [0, 0, 1]}, texts([[0.2, 0.1]] * 5))[0]["a", "share"]["difference_spread"]
-        is None
-    )
+    assert rows_what_if({"shift": [0, 0, 1]}, texts([[0.2, 0.1]] * 5))[0]["a", "share"]["difference_spread"] is None
 
 
-def test_unused_mesh_content_is_reported_once(tmp_path):
-    import mitsuba as mi
-
-    mi.set_variant("llvm_ad_rgb")
-    triangle = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
-    for name, extra in (("one", "usemtl red\n"), ("two", "vp 1 2\n")):
-        (tmp_path / f"{name}.obj").write_text(extra + triangle)
-    one, two = tmp_path / "one.obj", tmp_path / "two.obj"
-    areas = AreaSet((MeshPart("a", one), MeshPart("b", one, ((0, 0),))))
-    setting = load_aoi_scene(None, None, None, areas, StatisticsOptions(), ns)
-    assert setting.warnings == [f"of {one}: unused statements: usemtl"]
-    scene = mi.load_dict({"type": "scene", "s": {"type": "sphere"}})
-    setting = replace(setting, gaze_scene=GazeScene(SceneGeometry(None, scene), None, Similarity(), scene))
-    changes = Changes(add=(NewShape("c", one), NewShape("d", two)))
-    assert setting.apply_changes(changes).warnings == [*setting.warnings, f"of {two}: unused statements: vp"]
-
-
-def test_what_if_without_support(tmp_path):
-    result, _ = rows_what_if(tmp_path, {"shift": [0, 0, 1]}, texts([[0.2, 0.1]] * 5, np.nan))
+def test_what_if_without_support():
+    result, _ = rows_what_if({"shift": [0, 0, 1]}, texts([[0.2, 0.1]] * 5, np.nan))
     assert all(row["support"] is None for row in result.values())

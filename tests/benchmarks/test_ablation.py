@@ -7,10 +7,11 @@ import sys
 import numpy as np
 import pytest
 
+from nerg_mi.train.gaze_recipes import get_recipe
 from tests.conftest import ROOT
 from tests.evaluation.test_gaze import crowd
 
-LINE = "--geometry none --recipes default --steps 2 --test-zones 1 --test-positions 4 --min-rays 8 --radius 0.5"
+LINE = "--environment none --recipes default --steps 2 --test-zones 1 --test-positions 4 --min-rays 8 --radius 0.5"
 LINE += " --variant capture --variant emit_capture --seeds 2 --threads 1"
 
 
@@ -31,11 +32,14 @@ def ablation(monkeypatch):
 
 
 def test_variants_are_those_that_the_recipe_supports(ablation):
-    assert list(ablation.list_variants("default", True)) == ["emit", "capture", "emit_capture"]
-    paper = ablation.list_variants("paper", True)
-    assert paper["semantic snapshot, own too"] == {"semantic": "snapshot", "semantic_concat": True}
-    assert paper["begins as the field, frozen"] == {"init": "field", "freeze": True}
-    assert not {"semantic snapshot", "begins as the field"} & set(ablation.list_variants("paper", False))
+    default, paper = get_recipe("default"), get_recipe("paper")
+    assert list(ablation.list_variants(default, True)) == ["emit", "capture", "emit_capture"]
+    variants = ablation.list_variants(paper, True)
+    options = variants["semantic snapshot, own too"]["recipe"].options
+    assert (options.semantic, options.semantic_own) == ("snapshot", True)
+    frozen = variants["begins as the field, frozen"]["recipe"]
+    assert frozen.options.init_from_field and frozen.settings.freeze
+    assert not {"semantic snapshot", "begins as the field"} & set(ablation.list_variants(paper, False))
 
 
 def test_variants_are_trained_once_and_compared(ablation, tmp_path, monkeypatch):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import ROOT
+from tools import results
 
 
 @pytest.fixture
@@ -41,13 +42,6 @@ def test03_volpath_and_nerg_transmittances_agree(benchmark, rgb):
     assert difference < 0.02 and ours < 0.06 and theirs < 0.1
 
 
-def test04_figures_are_drawn(benchmark):
-    figures = benchmark("sizes")
-    curve = {"title": "a", "axis": "n", "sizes": [1, 2], "low": [1, 2], "middle": [1, 2], "high": [1, 3]}
-    page = figures.growth_figure([curve | {"exponent": 1.0}] * 4)
-    assert len([a for a in page.axes if a.get_visible()]) == 4 and "size^1.00" in page.axes[0].texts[0].get_text()
-
-
 def test05_missing_device_is_reported(benchmark, monkeypatch, capsys):
     bench = benchmark("bench")
     monkeypatch.setattr(bench, "has_cuda", lambda: False)
@@ -66,7 +60,7 @@ def test06_peak_memory_of_this_process(benchmark):
         memory.status("VmNothing")
 
 
-def test07_steps_alternate(benchmark, capsys):
+def test07_steps_alternate(benchmark, monkeypatch, tmp_path):
     """Equal numbers of steps of both, and the ratio of their times."""
 
     class Trainer:
@@ -75,7 +69,9 @@ def test07_steps_alternate(benchmark, capsys):
         def step(self):
             self.steps += 1
 
+    monkeypatch.setattr(results, "LATEST", tmp_path)
     ours, peer = Trainer(), Trainer()
-    benchmark("torch_radiance").take_turns(ours, peer, 3, steps=2, before=5)
+    benchmark("torch_radiance").take_turns(ours, peer, 3, "steps", steps=2, before=5)
     assert ours.steps == peer.steps == 5 + 2 + 3 * 2
-    assert capsys.readouterr().out.splitlines()[-1].startswith("PyTorch takes ")
+    rows = results.read("steps", tmp_path)["rows"]
+    assert [row[0] for row in rows] == ["nerg_mi", "PyTorch"] and rows[0][-2:] == ["1.0", "1.0"]

@@ -1,9 +1,9 @@
 """The measurement of visibility: exclusions, and that it distinguishes a good field from a wrong one."""
 
 import numpy as np
+from nerg_mi.scenes.store import SCENE_FILE
 
 from benchmarks.store_visibility import PAIRS, measure, near_edges
-from nerg_mi.workflows.demo import find_store_scene
 
 
 def test01_pixels_near_discontinuities_are_excluded():
@@ -19,7 +19,7 @@ def test01_pixels_near_discontinuities_are_excluded():
 
 
 def test02_blocks_occlude_like_the_furniture(standins):
-    row = measure(find_store_scene(), "aisle 3, from the south", "median", "depth", standins, 48, 2)
+    row = measure(SCENE_FILE, "aisle 3, from the south", "median", "depth", standins, 48, 2)
     # Blocks of 13 cm instead of shelves with boards and gaps
     assert row["agree"] > 0.85 and row["median cm"] < 15 and row["no surface"] < 0.05
     assert np.isclose(row["agree"] + row["wrongly seen"] + row["wrongly hidden"], 1)
@@ -27,12 +27,12 @@ def test02_blocks_occlude_like_the_furniture(standins):
 
 def test03_displaced_field_disagrees(standins, monkeypatch):
     camera, target, eye = PAIRS["aisle 3, from the south"]
-    right = measure(find_store_scene(), "aisle 3, from the south", "median", "depth", standins, 48, 2)
+    right = measure(SCENE_FILE, "aisle 3, from the south", "median", "depth", standins, 48, 2)
     # The field is evaluated for another eye than the twin
     monkeypatch.setitem(PAIRS, "moved", (camera, target, eye))
     from nerg_mi.scenes.store import twin
 
     visible = twin.is_visible
     monkeypatch.setattr(twin, "is_visible", lambda e, *a, **k: visible(np.asarray(e) + (1.7, 0, 0), *a, **k))
-    wrong = measure(find_store_scene(), "moved", "median", "depth", standins, 48, 2)
+    wrong = measure(SCENE_FILE, "moved", "median", "depth", standins, 48, 2)
     assert wrong["agree"] < right["agree"] - 0.1

@@ -10,7 +10,7 @@ import pytest
 
 from nerg_mi.cli import main
 from nerg_mi.cli.building import find_commands
-from nerg_mi.workflows.base import COMMANDS
+from nerg_mi.cli.declarations import COMMANDS
 from tests.cli.outputs import list_trainings, make_inputs
 
 

@@ -6,15 +6,17 @@ from __future__ import annotations
 import importlib.util
 import json
 import shlex
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from nerg_mi.aoi.output import has_parquet
 from nerg_mi.files.images import write_exr
 from nerg_mi.formats.ply import write_columns
-from nerg_mi.rays.rays import Rays
+from nerg_mi.tracking.rays import Rays
 from tests.evaluation.test_gaze import crowd
 from tests.figures.standins import write_standins
 from tests.formats.splats.writers import random_splats, write_inria
@@ -23,7 +25,8 @@ from tests.formats.test_torch_ngp import small_gaze, small_state
 from tests.pictures import SCENE
 from tests.plugins import fields
 from tests.surfaces.meshes import box
-from tests.workflows.watched import write_scene
+from tests.watched import write_scene
+from tools.with_defaults import find_defaults
 
 DEMO = "occlusion.png gaze.png gaze_sphere.png depth.png visibility.png color.png scene.exr report.html run.json"
 DEMO += " heatmap.glb aoi.csv"
@@ -39,12 +42,17 @@ BIDS += " ".join(
     for suffix in (".json", ".tsv.gz", "events.tsv.gz")
 )
 EVALUATION = "gaze.md gaze.csv persons.csv gaze.json positions.csv positions.png"
+EVALUATED = (
+    *(f"evaluation.gaze.{name}" for name in ("score_methods", "score_split_half", "score_participants")),
+    "evaluation.held_out.make_tuned_baselines",
+    "evaluation.held_out.correlate_uncertainty",
+)
 STATS = "aois.csv aois.md transitions.csv transitions.md durations.csv durations.md participants.csv participants.md "
 STATS += "aois.png transitions.png "
 STATS += "about.json"
 if has_parquet():
     STATS += " aois.parquet transitions.parquet durations.parquet participants.parquet"
-GAZE = "--radius 0.6 --probes 8 --steps 2 --directions 64 --validation-zones 0 --min-rays 8 --seed 1"
+GAZE = "--radius 0.6 --steps 2 --min-rays 8 --seed 1"
 
 
 @dataclass(frozen=True)
@@ -54,7 +62,7 @@ class Case:
     ``line``: the command line, with the folders ``{i}`` of the inputs and ``{o}`` of the outputs. ``files``: all files
     that it writes to ``{o}``. ``blocked``: outputs that an existing file or folder can block, which is reported before
     any work. ``once``: functions that take seconds and write nothing. ``needs_new_folder``: whether the output is a
-    folder that must not have any files."""
+    folder that must not have any files. ``defaults``: values of parameters that are no options."""
 
     name: str
     line: str
@@ -62,14 +70,23 @@ class Case:
     blocked: tuple[str, ...] = ()
     once: tuple[str, ...] = ()
     needs_new_folder: bool = False
+    defaults: Mapping[str, Any] = field(default_factory=dict)
+
+    def set_defaults(self, monkeypatch: Any, inputs: Path) -> None:
+        """Change the defaults of the function that the command calls."""
+        values = dict(self.defaults)
+        if self.name == "demo":
+            values["defaults"] = json.loads((inputs / "demo.json").read_text())
+        if not values:
+            return
+        defaults = find_defaults(self.name.split())
+        assert values.keys() <= defaults.keys()
+        for name, value in values.items():
+            monkeypatch.setitem(defaults, name, value)
 
     def arguments(self, inputs: Path, out: Path) -> list[str]:
         """The command line for these folders."""
-        words = [word.format(i=inputs, o=out) for word in [*self.name.split(), *shlex.split(self.line)]]
-        if self.name == "demo":
-            names = json.loads((inputs / "demo.json").read_text())
-            words += [word for key, value in names.items() for word in ("-D", f"{key}={value}")]
-        return words
+        return [word.format(i=inputs, o=out) for word in [*self.name.split(), *shlex.split(self.line)]]
 
     @property
     def targets(self) -> tuple[str, ...]:
@@ -83,10 +100,10 @@ def _below(folder: str, names: str) -> tuple[str, ...]:
 CASES = (
     Case(
         "demo",
-        "-o {o}/demo --width 24 --spp 1 -m llvm_ad_rgb",
+        "-o {o}/demo --width 24 -m llvm_ad_rgb",
         _below("demo", DEMO),
         ("demo",),
-        ("workflows.report._ReportWork.run", "workflows.bake.compute_sums"),
+        ("reports.report.ReportBuilder.build", "surfaces.bake.compute_sums"),
     ),
     Case("render", "{i}/scene.xml -o {o}/a.exr -m llvm_ad_rgb", ("a.exr",)),
     Case("render", "{i}/scene.xml -o {o}/a.png -m llvm_ad_rgb", ("a.png",)),
@@ -104,25 +121,21 @@ CASES = (
         ("a_0001.png", "a_0002.png"),
     ),
     Case("draw floor", "{i}/rays.npz -o {o}/a.png", ("a.png",)),
-    Case("draw floor", "{i}/rays.npz -o {o}/a.svg --scene {i}/ball.xml -m llvm_ad_rgb", ("a.svg",)),
-    Case("draw scanpath", "{i}/still.npz -o {o}/a.png --scene {i}/ball.xml -m llvm_ad_rgb", ("a.png",)),
+    Case("draw floor", "{i}/rays.npz -o {o}/a.svg --scene {i}/ball.xml", ("a.svg",)),
+    Case("draw scanpath", "{i}/still.npz {i}/ball.xml -o {o}/a.png", ("a.png",)),
     Case("draw sheet", "{i}/a.exr {i}/b.exr -o {o}/a.png --overlay gaze", ("a.png",)),
     Case("draw difference", "{i}/a.exr {i}/b.exr -o {o}/a.svg", ("a.svg",)),
-    Case("draw surface", "{i}/baked.ply -o {o}/a.png -m llvm_ad_rgb --width 32 --height 32", ("a.png",)),
-    Case("draw sphere", "{i}/watched/gaze.xml -o {o}/a.png -m llvm_ad_rgb --width 64 --spp 1", ("a.png",)),
-    Case("draw triptych", "{i}/watched/gaze.xml -o {o}/a.png -m llvm_ad_rgb --spp 1", ("a.png",)),
-    Case("scene", "{i}/rays.npz -o {o}/a.xml -m llvm_ad_rgb --geometry none", ("a.xml",)),
-    Case("scene", "{i}/rays.npz -o {o}/a.xml -m llvm_ad_rgb", ("a.xml", "a.vol", "a.color.vol")),
-    Case(
-        "scene",
-        "{i}/rays.npz -o {o}/a.xml -m llvm_ad_rgb --geometry none --person a --time-range 0,2 --max-gap 100",
-        ("a.xml", "a.frames.csv"),
-    ),
+    Case("draw surface", "{i}/baked.ply -o {o}/a.png --width 32 --height 32", ("a.png",)),
+    Case("draw sphere", "{i}/watched/gaze.xml -o {o}/a.png --width 64", ("a.png",)),
+    Case("draw triptych", "{i}/watched/gaze.xml -o {o}/a.png", ("a.png",)),
+    Case("scene", "{i}/rays.npz -o {o}/a.xml -e none", ("a.xml",)),
+    Case("scene", "{i}/rays.npz -o {o}/a.xml", ("a.xml", "a.vol", "a.color.vol")),
+    Case("scene", "{i}/rays.npz -o {o}/a.xml -e none --person a --time-range 0,2", ("a.xml", "a.frames.csv")),
     Case(
         "report",
-        "{i}/gaze.safetensors {i}/rays.npz -o {o}/a.html --width 24 --spp 1 --max-points 200 -m llvm_ad_rgb",
+        "{i}/gaze.safetensors {i}/rays.npz -o {o}/a.html --width 24 -m llvm_ad_rgb",
         ("a.html",),
-        once=("workflows.report._ReportWork.run",),
+        once=("reports.report.ReportBuilder.build",),
     ),
     Case("rays import", "{i}/day.csv -o {o}/a.npz --map 'origin=x,y,z direction=a,b,c t=t person=p'", ("a.npz",)),
     Case(
@@ -146,24 +159,24 @@ CASES = (
     Case("rays plot", "{i}/rays.npz -o {o}/a.png --kind layout", ("a.png",)),
     Case(
         "train radiance",
-        "{i}/photos -o {o}/a.safetensors --steps 2 --holdout 2 --half",
+        "{i}/photos -o {o}/a.safetensors --steps 2 --holdout 2",
         ("a.safetensors", "a.preview.png", "a.curves.csv", "a.curves.png"),
         ("a.safetensors", "a.preview.png", "a.curves.csv", "a.curves.png", "a.run"),
-        ("train.radiance_grid.DensityGrid.extract_occupancy", "train.radiance_run.warm_up"),
+        ("train.radiance_grid.MarchGrid.extract_occupancy", "train.radiance_run.warm_up"),
     ),
     Case(
         "train gaze",
-        "{i}/rays.npz -o {o}/a.safetensors --geometry hits " + GAZE,
+        "{i}/rays.npz -o {o}/a.safetensors --environment hits " + GAZE,
         ("a.safetensors", "a.vol"),
         ("a.safetensors", "a.vol", "a.run"),
-        ("train.gaze_folds.evaluate_folds",),
+        ("train.gaze_folds.evaluate_folds", "train.gaze_run.evaluate_folds", "train.gaze_ensemble.evaluate_folds"),
     ),
     Case(
         "train gaze",
-        "{i}/rays.npz -o {o}/a.safetensors --geometry none --ensemble 2 " + GAZE,
+        "{i}/rays.npz -o {o}/a.safetensors --environment none --ensemble 2 " + GAZE,
         ("a.safetensors",),
         ("a.safetensors", "a.run"),
-        ("train.gaze_folds.evaluate_folds",),
+        ("train.gaze_folds.evaluate_folds", "train.gaze_run.evaluate_folds", "train.gaze_ensemble.evaluate_folds"),
     ),
     Case("train prior", "{i}/rays.npz {i}/rays.npz -o {o}/a.safetensors", ("a.safetensors",)),
     Case(
@@ -174,24 +187,26 @@ CASES = (
     ),
     Case(
         "eval folds",
-        "{i}/rays.npz -o {o}/folds --store {i}/store --geometry none --folds 2 --test-zones 1 --test-positions 3 "
-        "--radius 0.6 --probes 8 --steps 2 --directions 128 --min-rays 8 --splits pos --seed 1",
+        "{i}/rays.npz -o {o}/folds --store {i}/store --environment none --folds 2 --test-zones 1 "
+        "--radius 0.6 --steps 2 --min-rays 8 --splits pos --seed 1",
         _below("folds", "folds.md folds.csv positions.csv folds.json"),
         ("folds",),
+        ("train.gaze_folds.evaluate_folds", "train.gaze_run.evaluate_folds", *EVALUATED),
+        defaults={"test_positions": 3},
     ),
     Case(
         "eval gaze",
-        "{i}/gaze.safetensors {i}/rays.npz -o {o}/eval --min-rays 8 --directions 128 --resamples 2 --pictures 1",
+        "{i}/gaze.safetensors {i}/rays.npz -o {o}/eval --min-rays 8 --resamples 2",
         _below("eval", EVALUATION),
         ("eval",),
-        tuple(f"evaluation.gaze.{name}" for name in ("evaluate_gaze", "score_split_half", "score_participants")),
+        EVALUATED,
     ),
     Case(
         "eval next",
-        "{i}/participants.safetensors {i}/rays.npz -o {o}/next --elapsed 12 --earlier 3 --max-looks 64 --resamples 2",
+        "{i}/participants.safetensors {i}/rays.npz -o {o}/next --elapsed 12 --resamples 2",
         _below("next", "next.md next.csv next.json"),
         ("next",),
-        ("workflows.next_look.evaluate_on_grid",),
+        ("evaluation.next_look_scores.evaluate_on_grid",),
     ),
     Case(
         "bake",
@@ -211,8 +226,8 @@ CASES = (
     Case("compile", "{i}/full.safetensors -o {o}/a.safetensors --resolution 16", ("a.safetensors",)),
     Case("export mesh", "{i}/field.safetensors -o {o}/a.ply --resolution 8 --density-threshold 3", ("a.ply",)),
     Case("export mesh", "{i}/field.safetensors -o {o}/a.glb --resolution 8 --density-threshold 3", ("a.glb",)),
-    Case("export points", "{i}/field.safetensors -o {o}/a.ply --resolution 8 --density-threshold 3", ("a.ply",)),
-    Case("export splats", "{i}/field.safetensors -o {o}/a.ply --resolution 8 --density-threshold 3", ("a.ply",)),
+    Case("export points", "{i}/field.safetensors -o {o}/a.ply --resolution 8", ("a.ply",)),
+    Case("export splats", "{i}/field.safetensors -o {o}/a.ply --resolution 8", ("a.ply",)),
     Case("export volume", "{i}/field.safetensors -o {o}/a.vol --color {o}/c.vol --resolution 8", ("a.vol", "c.vol")),
     Case("export scene", "{i}/room.ply {i}/rays.npz -o {o}/a.usdc", ("a.usdc",)),
     Case("export scene", "{i}/room.ply {i}/rays.npz -o {o}/a.rrd", ("a.rrd",)),
@@ -230,21 +245,20 @@ MAKES_A_FOLDER = {"poses"}
 """Commands that make a folder as a whole, which must not be there before: `test_scenes` tries them."""
 
 INPUTS = {
-    "scene": {"photos", "align"},
-    "view": {"aois", "align"},
+    "scene": {"environment", "photos", "align"},
+    "view": {"areas", "align"},
     "render": {"frames"},
     "stats": {"aois", "align", "zones", "cohorts", "what_if", "salt"},
     "draw floor": {"scene"},
-    "draw scanpath": {"scene"},
-    "align": {"field", "scene", "surface", "pairs", "tracking_surface", "tracking_cameras", "scene_cameras", "init"},
+    "align": {"environment", "surface", "pairs", "tracking_surface", "tracking_cameras", "scene_cameras", "init"},
     "rays events": {"targets"},
     "rays export": {"aois", "scene", "align"},
-    "rays import": {"salt", "poses", "place"},
+    "rays import": {"pseudonyms", "poses", "place"},
     "rays plot": {"test"},
-    "train gaze": {"views", "align_views", "field", "scene", "align"},
-    "eval folds": {"field", "scene", "align"},
-    "eval gaze": {"field", "scene", "geometry"},
-    "eval next": {"field", "scene", "geometry"},
+    "train gaze": {"views", "salience", "align_views", "environment", "align"},
+    "eval folds": {"environment", "align"},
+    "eval gaze": {"environment"},
+    "eval next": {"environment"},
     "report": {"aois"},
     "bake": {"gaze", "rays", "observer_file", "align"},
 }
@@ -258,7 +272,7 @@ def make_inputs(folder: Path) -> Path:
 
     from nerg_mi.fields.encoding import HashGridConfig
     from nerg_mi.fields.occupancy import OccupancyGrid
-    from nerg_mi.fields.radiance import RadianceConfig, RadianceField
+    from nerg_mi.fields.radiance import RadianceConfig, RadianceNetwork
     from nerg_mi.formats.fields import save_radiance
     from nerg_mi.maths.geometry import Box
 
@@ -292,7 +306,7 @@ def make_inputs(folder: Path) -> Path:
         save(folder / "nerg.pth", small_gaze(), nerf=small_state())
     # These are the sizes of torch-ngp.
     cells = OccupancyGrid(np.random.default_rng(1).random((128, 128, 128)) < 0.3, ns, 0.01)
-    ngp = RadianceField.random(RadianceConfig(HashGridConfig()), Box((-1, -1, -1), (1, 1, 1)), ns, occupancy=cells)
+    ngp = RadianceNetwork.random(RadianceConfig(HashGridConfig()), Box((-1, -1, -1), (1, 1, 1)), ns, occupancy=cells)
     save_radiance(ngp, folder / "ngp.safetensors", {}, half=True)
 
     photos, frames = folder / "photos", []
@@ -311,7 +325,7 @@ def make_inputs(folder: Path) -> Path:
 def list_trainings(folder: Path) -> list[list[str]]:
     """Command lines that train the gaze fields of `CASES` on the inputs in ``folder``, without and with held-out
     participants."""
-    line = f"train gaze {folder}/rays.npz --geometry hits --radius 0.5 --probes 8 --steps 2 --directions 64"
-    line += " --validation-zones 0 --min-rays 8 --test-zones 1 --test-positions 3"
+    line = f"train gaze {folder}/rays.npz --environment hits --radius 0.5 --steps 2"
+    line += " --min-rays 8 --test-zones 1 --test-positions 3"
     more = f"-o {folder}/gaze.safetensors", f"--test-participants 0.5 -o {folder}/participants.safetensors"
     return [[*line.split(), *words.split()] for words in more]

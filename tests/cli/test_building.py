@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import ast
+import inspect
 import math
 import re
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -16,18 +17,18 @@ import typer
 from typer.testing import CliRunner
 
 import nerg_mi.cli
-import nerg_mi.workflows
 from nerg_mi.cli import building
 from nerg_mi.cli.building import DEBUG, GROUPS, find_commands, make_callback
+from nerg_mi.cli.declarations import COMMANDS, Command, argument, extra
+from nerg_mi.cli.signatures import read_signature
 from nerg_mi.cli.table import ROWS, Row
 from nerg_mi.errors import NergError
 from nerg_mi.files.values import FilePath
 from nerg_mi.options import option, parse_numbers
 from nerg_mi.progress import Progress, Reporter
 from nerg_mi.ranges import KAPPAS, Range, ValidatedDataclass, check_ranges, setting
-from nerg_mi.rays.readers.base import list_options
-from nerg_mi.rays.readers.registry import collect_shared_options, get_reader, list_preset_names
-from nerg_mi.workflows.base import COMMANDS, Command, argument, extra
+from nerg_mi.tracking.readers.base import list_options
+from nerg_mi.tracking.readers.registry import collect_shared_options, get_reader, list_preset_names
 from tools.command_pages import iter_commands
 
 
@@ -54,7 +55,7 @@ def serve():
         handed.append((cup, options, table))
 
     cup, table = argument("What it is poured into.", str), extra(1, "Where it is served.", int, "--table")
-    command = Command("tea", tea, "Make tea.", "", Brew, ("secret",), None, {"cup": cup, "table": table})
+    command = Command("tea", tea, "Make tea.", "", Brew, ("secret",), {"cup": cup, "table": table})
     app = typer.Typer(rich_markup_mode=None)
     app.command(help="Make tea.")(make_callback(command))
 
@@ -105,7 +106,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from nerg_mi.workflows.base import argument, command
+from nerg_mi.cli.declarations import argument, command
 from nerg_mi.options import option
 from nerg_mi.ranges import Range, ValidatedDataclass
 
@@ -133,17 +134,17 @@ def test_a_command_is_one_module(monkeypatch, tmp_path, capsys):
 
     (tmp_path / "kindness").mkdir()
     (tmp_path / "kindness" / "greeting.py").write_text(GREETING)
-    monkeypatch.setattr(nerg_mi.workflows, "__path__", [*nerg_mi.workflows.__path__, str(tmp_path)])
+    monkeypatch.setattr(nerg_mi.cli, "__path__", [*nerg_mi.cli.__path__, str(tmp_path)])
     try:
         assert nerg("--help")[1].split()[-3:] == ["greet", "Commands:", "kindly."]
         assert "kindly  Say something kind." in nerg("greet", "--help")[1]
-        assert "nerg_mi.workflows.kindness.greeting" not in sys.modules
+        assert "nerg_mi.cli.kindness.greeting" not in sys.modules
         code, said = nerg("greet", "kindly", "--help")
         assert code == 0 and "Say something kind.\n\n  It costs nothing." in said and "How often." in said
         assert nerg("greet", "kindly", "Ada", "--times", "2") == (0, "hello Ada\nhello Ada\n")
         assert nerg("greet", "kindly", "Ada", "--times", "10")[0] == 2
     finally:
-        for name in ("nerg_mi.workflows.kindness.greeting", "nerg_mi.workflows.kindness"):
+        for name in ("nerg_mi.cli.kindness.greeting", "nerg_mi.cli.kindness"):
             sys.modules.pop(name, None)
         COMMANDS.pop("greet kindly", None)
 
@@ -249,7 +250,6 @@ def test_a_command_is_one_row(monkeypatch, tmp_path, capsys):
 
 def test_a_function_with_an_output_writes_during_its_work(monkeypatch, tmp_path, capsys):
     row = Row("record", f"{__name__}:record", "Record.", ("names",), computes=False)
-    row = replace(row, alternatives={"room": {"hall": "A hall.", "studio": "A studio."}})
     monkeypatch.setitem(ROWS, "record", row)
     monkeypatch.setattr(building, "TABLE", (row,))
     with pytest.raises(SystemExit) as end:
@@ -257,11 +257,8 @@ def test_a_function_with_an_output_writes_during_its_work(monkeypatch, tmp_path,
     assert not end.value.code and (tmp_path / "notes").is_dir()
     assert capsys.readouterr().out == "recorded in None\n"
     with pytest.raises(SystemExit) as end:
-        nerg_mi.cli.main(["record", "a", "-o", str(tmp_path / "more"), "--studio", "b"])
+        nerg_mi.cli.main(["record", "a", "-o", str(tmp_path / "more"), "--room", "b"])
     assert not end.value.code and capsys.readouterr().out == "recorded in b\n"
-    with pytest.raises(SystemExit) as end:
-        nerg_mi.cli.main(["record", "a", "-o", str(tmp_path / "third"), "--studio", "b", "--hall", "c"])
-    assert end.value.code == 1 and "--hall and --studio" in capsys.readouterr().err
     with pytest.raises(SystemExit) as end:
         nerg_mi.cli.main(["record", "a"])
     assert end.value.code == 2
@@ -314,11 +311,11 @@ def test_a_command_writes_further_files(monkeypatch, tmp_path, capsys):
 
 def test_a_command_line_without_a_command_is_refused(monkeypatch, tmp_path, capsys):
     (tmp_path / "nothing.py").write_text('"""``nerg nothing``: Do nothing."""\n')
-    monkeypatch.setattr(nerg_mi.workflows, "__path__", [*nerg_mi.workflows.__path__, str(tmp_path)])
+    monkeypatch.setattr(nerg_mi.cli, "__path__", [*nerg_mi.cli.__path__, str(tmp_path)])
     with pytest.raises(SystemExit) as end:
         nerg_mi.cli.main(["nothing"])
-    sys.modules.pop("nerg_mi.workflows.nothing")
-    assert end.value.code == 70 and "nerg_mi.workflows.nothing lists the command" in capsys.readouterr().err
+    sys.modules.pop("nerg_mi.cli.nothing")
+    assert end.value.code == 70 and "nerg_mi.cli.nothing lists the command" in capsys.readouterr().err
 
 
 def show_help(*line):
@@ -347,7 +344,7 @@ def test_help_of_an_import_shows_the_options_of_its_preset():
     assert [flag for flag in shared if shows(plain, flag)] == ["--map"] and shows(plain, "--pseudonyms")
     for name in list_preset_names():
         text = show_help("rays", "import", f"--preset={name}")
-        options = {o.flag for o in list_options(get_reader(name).Options)}
+        options = {o.flag for o in list_options(get_reader(name).Options) if o.flag}
         assert {flag for flag in shared if shows(text, flag)} == options
         assert "".join(get_reader(name).files.replace("`", "").split()) in "".join(text.split())
         assert shows(text, "--skip-bad-lines")
@@ -367,8 +364,17 @@ def test_help_of_an_unknown_preset_names_the_presets():
 FOREIGN = set("--output_type --force-reinstall --bind --directory --tcnn --ff --color_space --bg_radius --no-".split())
 
 
+@pytest.mark.parametrize("name", ROWS)
+def test_rows_leave_out_existing_parameters(name):
+    row = ROWS[name]
+    parameters = inspect.signature(read_signature(row.function)).parameters
+    settings = [p.default for p in parameters.values() if is_dataclass(p.default)]
+    names = {*parameters, "mode", *(f.name for default in settings for f in fields(default))}
+    assert set(row.without) <= names
+
+
 def test_texts_name_existing_options():
-    existing = {"--help", "--version", *DEBUG, *FOREIGN}
+    existing = {"--help", "--version", "--install-completion", "--show-completion", *DEBUG, *FOREIGN}
     for _, command, _ in iter_commands():
         existing.update(*((*p.opts, *p.secondary_opts) for p in command.params))
     package = Path(nerg_mi.cli.__file__).parent.parent

@@ -104,11 +104,11 @@ import nerg_mi.cli
     assert (done.returncode, done.stderr) == (INTERRUPTED, "Interrupted.\n")
 
 
-@pytest.mark.parametrize("spelt", [["--cell-size", "1,5"], ["--cell-size=1,5"]])
+@pytest.mark.parametrize("spelt", [["--thin", "1,5"], ["--thin=1,5"]])
 def test_invalid_values_are_named(capsys, spelt):
     with pytest.raises(SystemExit):
-        main(["rays", "plot", "a.npz", "-o", "b.png", *spelt])
-    assert "--cell-size" in (said := capsys.readouterr().err) and 'got "1,5"' in said
+        main(["rays", "filter", "a.npz", "-o", "b.npz", *spelt])
+    assert "--thin" in (said := capsys.readouterr().err) and 'got "1,5"' in said
 
 
 @pytest.mark.parametrize("long", ["x" * 1500, "1 " * 750, "a" * 700 + "=" + "b" * 800, "it's " * 300, "z,9" * 500])
@@ -304,8 +304,8 @@ def interrupted(name: str, calls: int, *arguments, sent: str = "SIGINT") -> subp
     )
 
 
-ENDLESS = "--steps 1000000 --save-every 0"
-GAZE = "--geometry none --radius 0.6 --probes 8 --directions 64 --validation-zones 0 --min-rays 8"
+ENDLESS = "--steps 1000000"
+GAZE = "--environment none --radius 0.6 --min-rays 8"
 
 
 # A radiance training makes and discards these steps before its first one.
@@ -340,7 +340,7 @@ def test_an_interrupted_radiance_training_saves_state_and_result(inputs, tmp_pat
 
 
 def test_an_interrupted_ensemble_saves_members_and_state(inputs, tmp_path):
-    some = "--variant capture --steps 3 --ensemble 2 --save-every 0"
+    some = "--variant capture --steps 3 --ensemble 2"
     line = f"train gaze {inputs}/rays.npz -o {tmp_path}/a.safetensors {GAZE} {some}"
     done = interrupted("train.gaze_log_density.LikelihoodTrainer.step", 5, *line.split())
     assert done.returncode == 130 and "member 2 of 2; resume with --resume" in done.stderr, done.stderr
@@ -359,7 +359,7 @@ ENDS = {
         "study slab -o {o} --quick --width 12 --height 8 --only jitter -m llvm_ad_rgb",
     ),
     "rays import": (
-        "rays.readers.table.add_tables",
+        "tracking.readers.table.add_tables",
         1,
         "rays import {i}/day.csv -o {o}/a.npz --map 'origin=x,y,z direction=a,b,c t=t person=p'",
     ),
@@ -383,8 +383,7 @@ def test_an_interrupted_command_exits_immediately(name, inputs, tmp_path):
 
 KILLED = {
     "bake": "bake {i}/room.ply --rays {i}/rays.npz --max-edge 2 -m llvm_ad_rgb -o {o}/a.ply -o {o}/a.csv -o {o}/a.json",
-    "report": "report {i}/gaze.safetensors {i}/rays.npz -o {o}/a.html --width 24 --spp 1 -m llvm_ad_rgb "
-    "--max-points 200",
+    "report": "report {i}/gaze.safetensors {i}/rays.npz -o {o}/a.html --width 24 -m llvm_ad_rgb",
 }
 """Command lines. Each output is synchronised by `os.fsync`, and then moved to its place by `os.replace`."""
 

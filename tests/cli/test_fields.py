@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import fields
 from pathlib import Path
 
 import drjit.llvm.ad as ns
@@ -12,18 +11,19 @@ import numpy as np
 import pytest
 import trimesh
 
+from nerg_mi.errors import NergError
 from nerg_mi.fields.occupancy import OccupancyGrid
 from nerg_mi.files.atomic import file_sha256
 from nerg_mi.formats.checkpoint import read_checkpoint, read_metadata
 from nerg_mi.formats.fields import load_gaze, load_radiance, matches_checksum
 from nerg_mi.formats.torch_files import write_torch
-from nerg_mi.workflows.base import COMMANDS
-from nerg_mi.workflows.gaze_commands import GazeOptions
+from nerg_mi.train.compile import compile_field
 from tests.evaluation.test_gaze import crowd
 from tests.formats.test_torch_ngp import save_nerg as save
 from tests.formats.test_torch_ngp import small_gaze, small_state
 from tests.plugins.fields import radiance
-from tests.train.gaze.looks import looking_at
+from tests.recorder import Recorder
+from tests.refusals import mentions
 
 # ---- Radiance fields ----
 
@@ -47,14 +47,10 @@ def test_speed_and_complaints_are_reported(cube, nerg):
     assert [x for x in provenance["complaints"] if x.startswith("only 3 steps")]
 
 
-# The command, and its message if the photos can be read; photos of a single grey have no saliency.
+# The command, and its message if the photos can be read.
 OUTSIDE = {
     "train radiance": ("train radiance {c}/set -o {c}/out.safetensors --steps 2 --holdout 3", r"2 steps in"),
     "eval radiance": ("eval radiance {c}/cube.safetensors {c}/set --holdout 2 -o {c}/out.safetensors", r"PSNR"),
-    "train gaze": (
-        "train gaze -o {c}/out.safetensors --views {c}/set --salience spectral-residual --field {c}/cube.safetensors",
-        "no saliency",
-    ),
 }
 
 
@@ -94,41 +90,6 @@ def other_value(f):
     return value if value != f.default else value + 1
 
 
-def test_the_workflow_receives_the_options(handed, nerg):
-    """All options, and no options."""
-    calls = handed("train gaze")
-    shown = [f for f in fields(GazeOptions) if f.name not in COMMANDS["train gaze"].without]
-    options = GazeOptions(**{f.name: other_value(f) for f in shown})
-    line = []
-    for f in shown:
-        flag = (f.metadata["names"] or ("--" + f.name.replace("_", "-"),))[-1]
-        value = getattr(options, f.name)
-        if isinstance(value, bool):
-            line.append(flag.split("/")[0 if value else -1])
-        else:
-            line += [flag, value]
-    assert nerg("train", "gaze", "rays.npz", "-o", "out.safetensors", *line).code == 0
-    assert nerg("train", "gaze", "-o", "out.safetensors").code == 0
-    output = Path("out.safetensors")
-    assert calls == [
-        {"rays": Path("rays.npz"), "output": output, "options": options},
-        {"rays": None, "output": output, "options": GazeOptions()},
-    ]
-
-
-def test_a_field_starts_from_features_and_weights(tmp_path, nerg):
-    radiance(tmp_path / "field.safetensors", density_scale=30.0)
-    taken = load_radiance(tmp_path / "field.safetensors", ns)[0]
-    looking_at((0.5, 0.1, 0.2), 300).save(tmp_path / "rays.npz")
-    line = "train gaze {o}/rays.npz -o {o}/gaze.safetensors --field {o}/field.safetensors --recipe small --steps 4 "
-    line += "--semantic snapshot --probes 6 --radius 0.5 --min-rays 8 --directions 32 --validation-zones 0"
-    ended = nerg(*line.format(o=tmp_path).split(), "--init", "field", "--freeze")
-    assert ended.code == 0, ended.err
-    trained, metadata = load_gaze(tmp_path / "gaze.safetensors", ns)
-    assert trained.config.semantic == "snapshot" and metadata["provenance"]["begins_as"] == "field.safetensors"
-    np.testing.assert_array_equal(np.array(trained.grid.table), np.array(taken.grid.table))
-
-
 @pytest.mark.parametrize("recipe", ["default", "small"])
 def test_a_field_is_trained_from_salience_images(recipe, tmp_path, nerg, rgb):
     """Six photos from positions a metre apart; five of them have saliency maps."""
@@ -145,8 +106,8 @@ def test_a_field_is_trained_from_salience_images(recipe, tmp_path, nerg, rgb):
     # The recipe small needs a geometry: a scene of one wall.
     scene, out = tmp_path / "wall.xml", tmp_path / "out.safetensors"
     scene.write_text('<scene version="3.0.0"><shape type="cube"/></scene>')
-    place = ["--geometry", "none"] if recipe == "default" else ["--scene", scene]
-    quick = "--steps 2 --directions 64 --validation-zones 0".split()
+    place = ["--environment", "none" if recipe == "default" else scene]
+    quick = "--steps 2".split()
     images = ["--views", tmp_path, "--salience", tmp_path / "maps"]
     ended = nerg("train", "gaze", *images, "--recipe", recipe, *place, *quick, "-o", out)
     assert ended.code == 0, ended.err
@@ -162,13 +123,13 @@ def test_a_field_is_trained_from_salience_images(recipe, tmp_path, nerg, rgb):
 def test_a_field_is_scored_as_it_was_trained(tmp_path, nerg):
     crowd().save(tmp_path / "rays.npz")
     gaze = tmp_path / "gaze.safetensors"
-    line = "--geometry hits --voxel-size 0.2 --radius 0.6 --steps 5 --directions 64 --probes 20 --validation-zones 0"
+    line = "--environment hits --radius 0.6 --steps 5"
     train = ["train", "gaze", tmp_path / "rays.npz", "-o", gaze, *line.split()]
     assert nerg(*train).code == 0
     ended = nerg("eval", "gaze", gaze, tmp_path / "rays.npz")
     assert ended.code == 1 and "--test-zones 3" in ended.err
     assert nerg(*train, "--test-zones", "2", "--test-positions", "6", "--test-participants", "0.5").code == 0
-    line = "--min-rays 16 --resamples 4 --directions 256 --pictures 1"
+    line = "--min-rays 16 --resamples 4"
     assert nerg("eval", "gaze", gaze, tmp_path / "rays.npz", *line.split()).code == 0
     scores = json.loads((tmp_path / "gaze.eval" / "gaze.json").read_text())
     names = [r["method"] for r in scores["methods"]]
@@ -197,9 +158,9 @@ def test_a_nerf_and_its_gaze_are_imported(tmp_path, nerg, torch):
     path = save(tmp_path / "nerg.pth", small_gaze(), nerf=small_state())
     ended = nerg("import", path, "-o", tmp_path / "field.safetensors")
     assert ended.code == 0 and "--gaze" in ended.out
-    ended = nerg("import", path, "-o", tmp_path / "f.safetensors", "-g", tmp_path / "g.safetensors", "--half")
+    ended = nerg("import", path, "-o", tmp_path / "f.safetensors", "-g", tmp_path / "g.safetensors")
     assert ended.code == 0 and "gaze: emit_capture, trunk layernorm, bound 1" in ended.out
-    assert (tmp_path / "g.safetensors").stat().st_size < 0.6 * small_gaze()["encoder.embeddings"].nbytes + 1e5
+    assert (tmp_path / "g.safetensors").is_file()
 
 
 def test_a_field_is_exported_in_each_format(tmp_path, nerg):
@@ -210,8 +171,8 @@ def test_a_field_is_exported_in_each_format(tmp_path, nerg):
         assert ended.code == 0, ended.err
         return ended.out
 
-    assert "50 points" in export("points", "p.ply", "--resolution", 16, "--density-threshold", 3, "--max-points", 50)
-    assert len(trimesh.load(tmp_path / "p.ply").vertices) == 50
+    said = export("points", "p.ply", "--resolution", 8)
+    assert f"{len(trimesh.load(tmp_path / 'p.ply').vertices):,} points" in said
     said = export("volume", "d.vol", "--color", tmp_path / "c.vol", "--resolution", 8)
     assert "8 x 8 x 8 voxels from (-1, -1, -1) to (1, 1, 1)" in said
     assert (tmp_path / "c.vol").stat().st_size == 48 + 8**3 * 3 * 4 == 3 * (tmp_path / "d.vol").stat().st_size - 2 * 48
@@ -227,25 +188,24 @@ def test_a_compiled_field_states_its_errors(tmp_path, nerg):
     meta = read_metadata(tmp_path / "g.safetensors")
     assert meta["provenance"]["compiled"]["resolution"] == meta["voxels"]["resolution"] == 64
     assert matches_checksum(tmp_path / "g.safetensors", file_sha256(tmp_path / "f.safetensors"))
-    for options, words in (
-        (["--resolution", "60"], "multiple of 8"),
-        (["--resolution", "256", "--memory", "1"], "--memory"),
-    ):
-        ended = nerg("compile", tmp_path / "f.safetensors", "-o", tmp_path / "h.safetensors", *options)
-        assert ended.code == 1 and words in ended.err and not (tmp_path / "h.safetensors").exists()
+    ended = nerg("compile", tmp_path / "f.safetensors", "-o", tmp_path / "h.safetensors", "--resolution", "60")
+    assert ended.code == 1 and "multiple of 8" in ended.err and not (tmp_path / "h.safetensors").exists()
+    with pytest.raises(NergError, check=mentions("memory")):
+        compile_field(tmp_path / "f.safetensors", resolution=256, memory=1)
     ended = nerg("compile", tmp_path / "g.safetensors", "-o", tmp_path / "h.safetensors")
     assert ended.code == 1 and "compiled already" in ended.err
 
 
-def test_a_compiled_field_is_as_accurate_as_requested(tmp_path, nerg):
+@pytest.mark.nightly
+def test_a_compiled_field_is_as_accurate_as_requested(tmp_path):
     radiance(tmp_path / "f.safetensors", density_scale=5.0)
+    recorder = Recorder()
     loose, strict = (
-        nerg("compile", tmp_path / "f.safetensors", "-o", tmp_path / "g.safetensors", *options)
-        for options in (["--min-psnr", "10", "--max-depth-error", "1"], ["--memory", "300", "--min-psnr", "100"])
+        compile_field(tmp_path / "f.safetensors", min_psnr=psnr, max_depth_error=error, progress=recorder)
+        for psnr, error in ((10, 1), (100, None))
     )
-    assert loose.code == strict.code == 0
-    assert "256 cells" in loose.out and "512 cells" not in loose.out
-    assert "512 cells" in strict.out or "256" in strict.err
+    assert loose.provenance["compiled"]["resolution"] == 256
+    assert strict.provenance["compiled"]["resolution"] == 512 or "256" in recorder.warnings[0]
 
 
 def test_a_refined_field_is_reported(tmp_path, nerg):

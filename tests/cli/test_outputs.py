@@ -17,9 +17,9 @@ import pytest
 
 import nerg_mi.cli
 from nerg_mi.cli.building import find_commands, make_callback
+from nerg_mi.cli.declarations import COMMANDS
 from nerg_mi.cli.signatures import make_command
 from nerg_mi.cli.table import ROWS
-from nerg_mi.workflows.base import COMMANDS
 
 from .outputs import CASES, INPUTS, MAKES_A_FOLDER, OF_TORCH
 
@@ -89,7 +89,15 @@ def offline(monkeypatch):
     refuse("connect"), refuse("connect_ex"), refuse("bind"), refuse("sendto")
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda c: f"{c.name} {Path(c.files[0]).suffix}")
+def _make_parameter(case):
+    """Cases that take seconds and write with the functions of other cases are nightly."""
+    name = f"{case.name} {Path(case.files[0]).suffix}"
+    long = ("demo", "eval folds", "eval gaze", "eval next", "report", "study")
+    is_long = case.name in long or "--ensemble" in case.line
+    return pytest.param(case, id=name, marks=[pytest.mark.nightly] * is_long)
+
+
+@pytest.mark.parametrize("case", [_make_parameter(case) for case in CASES])
 def test_an_output_is_written_atomically(case, inputs, tmp_path, capsys, monkeypatch, rgb, offline):
     if case.name in OF_TORCH:
         pytest.importorskip("torch")
@@ -103,6 +111,7 @@ def test_an_output_is_written_atomically(case, inputs, tmp_path, capsys, monkeyp
         if case.files[0].endswith(suffix):
             pytest.importorskip(module)
 
+    case.set_defaults(monkeypatch, inputs)
     for name in case.once:
         remember(monkeypatch, f"nerg_mi.{name}")
 
@@ -170,7 +179,7 @@ def test_filtering_in_place_on_a_full_disk_keeps_the_input(inputs, tmp_path, cap
     for name in ("rays.npz", "rays.parquet"):
         if name.endswith(".parquet"):
             pytest.importorskip("pyarrow")
-        from nerg_mi.rays.rays import Rays
+        from nerg_mi.tracking.rays import Rays
 
         Rays.load(inputs / "rays.npz").save(tmp_path / name)
         before = (tmp_path / name).read_bytes()
@@ -206,7 +215,6 @@ def path_options(command, parameters) -> dict[str, tuple]:
 
 def test_every_output_option_has_a_case(tmp_path):
     """Each option with a path is an output in `outputs.CASES`, or an input."""
-    (tmp_path / "demo.json").write_text("{}")
     commands_by_name = commands()
     assert set(commands_by_name) >= {c.name for c in CASES} | set(MAKES_A_FOLDER) | set(INPUTS)
     for name, command in commands_by_name.items():

@@ -15,11 +15,11 @@ import pytest
 import trimesh
 from PIL import Image
 
+from nerg_mi.environment.scene_loading import check_scene_file
 from nerg_mi.errors import NergError
 from nerg_mi.formats.torch_files import write_torch
 from nerg_mi.photos import structure
-from nerg_mi.rays.rays import Rays
-from nerg_mi.rendering.scene import check_scene_file
+from nerg_mi.tracking.rays import Rays
 from nerg_mi.train import poses
 from tests.formats.test_torch_ngp import save_nerg as save
 from tests.formats.test_torch_ngp import small_gaze, small_state
@@ -62,25 +62,24 @@ def small(tmp_path_factory):
     return folder
 
 
-GAZE = "train gaze rays.npz -o {o}/a.safetensors --geometry none --steps 1"
-VIEWS = "train gaze -o {o}/a.safetensors --steps 2 --directions 64 --validation-zones 0"
-PHOTOS = f"{VIEWS} --geometry none --views photos"
+GAZE = "train gaze rays.npz -o {o}/a.safetensors --environment none --steps 1"
+VIEWS = "train gaze -o {o}/a.safetensors --steps 2"
+PHOTOS = f"{VIEWS} --environment none --views photos"
 LINES = {
     # Options that contradict each other, or have invalid values.
-    f"{GAZE} --variant both": "give other values by --variant and --activation",
+    f"{GAZE} --variant both": "--variant must be",
     f"{GAZE} --mode scalar_rgb": 'not "scalar_rgb"',
     f"{GAZE} --mode llvm_rgb": 'there is no Mitsuba variant "llvm_rgb"',
     f"{GAZE} --ensemble 1": "at least two members",
     f"{PHOTOS} --salience no": 'the folder "no" of salience images does not exist',
     f"{PHOTOS} --salience photos": "has colours",
-    f"{PHOTOS} --salience maps --salience-unit degree": "per must be pixel or steradian",
     "train radiance empty -o {o}/a.safetensors --resume": "no state to resume",
-    "train radiance empty -o {o}/a.safetensors --steps 5 --minutes 1": "exactly one|either in steps or in minutes",
+    "train radiance empty -o {o}/a.safetensors --steps 5 --minutes 1": "--minutes and --steps are alternatives",
     "eval radiance no.safetensors photos -o {o}/a": "does not exist",
     "scene a.obj -o {o}/a.png": r"choose a file name that ends in \.xml",
     "scene a.obj -o {o}/a.xml --observer 1,2": "--observer must be three numbers",
     "render scene.xml -o {o}/a.bmp": r"choose a file name that ends in \.exr or \.png",
-    "render scene.xml -o {o}/a.exr -s 7": r"has 2 sensor\(s\), and index 7 is out of range",
+    "render scene.xml -o {o}/a.exr -s 7": r"has 2 sensor\(s\), and --sensor 7 is out of range",
     "render scene.xml -o {o}/a.exr -D level": "write KEY=VALUE",
     "render scene.xml -o {o}/a.exr -D integrator=nope": '"nope" not found',
     "render scene.xml -o {o}/a.exr -D levle=2": r'does not use "\$levle"; correct the name',
@@ -88,13 +87,9 @@ LINES = {
     "render none.xml -o {o}/a.exr": "there is no scene file",
     # The message of a plugin arrives in an exception of Mitsuba, which quotes the traceback of the original.
     "render deep.xml -o {o}/a.exr -m llvm_ad_rgb": "\"depth\" must be one of expected, median, refined, got 'deep'$",
-    "demo -o {o}/a --width 4": "at least 12 pixels",
     "draw sheet gone.png -o {o}/a.png": "there is no file",
     "draw sphere gone.xml -o {o}/a.gif": r"ends in \.png or \.svg",
     "study nowhere -o {o}/a": '"nowhere" is neither a scene file',
-    "study nowhere -o {o}/a --scene-kind analytic": "choose one of slab, sphere",
-    "study slab -o {o}/a --scene-kind shapes": 'kind of scene must be one of .* got "shapes"',
-    "study slab -o {o}/a --width 2": "at least 4 x 4 pixels",
     "study slab -o {o}/a --only 'nothing of it'": 'no setting matches "nothing of it"',
     "study slab -o {o}/a --only (": r'"\(" is not a regular expression',
     "stats rays.npz -o {o}/a": "--aois FILE",
@@ -102,7 +97,7 @@ LINES = {
     "jobs empty": "contains no parts of jobs",
     "worker somewhere": "is not a scheduler address",
     "export mesh f.safetensors -o {o}/a.obj": r"ends in \.ply or \.glb",
-    "export points f.safetensors -o {o}/a.ply --resolution 8 --density-threshold 1e9": "does not cross",
+    "export mesh f.safetensors -o {o}/a.ply --resolution 8 --density-threshold 1e9": "does not cross|scikit",
     "export points f.safetensors -o {o}/a.glb --up x": "--up must be",
     "export splats f.safetensors -o {o}/a.splat": r"ends in \.ply",
     "export volume f.safetensors -o {o}/a.exr": r"ends in \.vol",
@@ -111,7 +106,6 @@ LINES = {
     "import ngp.pth": "no output is given",
     "import ngp.pth -g {o}/g.safetensors": "contains no gaze field",
     "import nerg.pth -o {o}/a.safetensors": "a gaze field but no NeRF",
-    "import ngp.pth -o {o}/a.safetensors --ema": "no moving averages",
     "import ngp.pth -o {o}/a.safetensors --color-space xyz": "--color-space must be",
     "poses photos/0.png -o {o}/a": "is a single photo",
     "poses photos/nowhere -o {o}/a": "there is no video",
@@ -172,18 +166,18 @@ PIPES = [
     "rays guess {p}.csv",
     "rays show {p}.npz",
     "rays show {p}.parquet",
-    f"train gaze {RAYS} -o {{o}}/a.safetensors --field {{p}}.safetensors",
-    f"train gaze {RAYS} -o {{o}}/a.safetensors --field {{p}}.ply",
-    f"train gaze {RAYS} -o {{o}}/a.safetensors --scene {{p}}.xml",
-    f"train gaze {RAYS} -o {{o}}/a.safetensors --scene {{i}}/scene.xml --align {{p}}.json",
-    "train gaze -o {o}/a.safetensors --geometry none --views {p}.json --salience {p}.npz",
+    f"train gaze {RAYS} -o {{o}}/a.safetensors --environment {{p}}.safetensors",
+    f"train gaze {RAYS} -o {{o}}/a.safetensors --environment {{p}}.ply",
+    f"train gaze {RAYS} -o {{o}}/a.safetensors --environment {{p}}.xml",
+    f"train gaze {RAYS} -o {{o}}/a.safetensors --environment {{i}}/scene.xml --align {{p}}.json",
+    "train gaze -o {o}/a.safetensors --environment none --views {p}.json --salience {p}.npz",
     "train radiance {p}.json -o {o}/a.safetensors",
     "eval gaze {p}.safetensors " + RAYS,
     f"align {RAYS} --surface {{p}}.ply -o {{o}}/a.json",
     f"align {RAYS} --surface {{p}}.npy -o {{o}}/a.json",
     f"align {RAYS} --surface {{p}}.csv -o {{o}}/a.json",
     "align --pairs {p}.csv -o {o}/a.json",
-    f"align {RAYS} --scene {{p}}.xml -o {{o}}/a.json",
+    f"align {RAYS} --environment {{p}}.xml -o {{o}}/a.json",
     f"stats {RAYS} -o {{o}}/s --aois {{p}}.json",
     f"stats {RAYS} {{p}}.vol -o {{o}}/s --aois {{i}}/areas.json",
     f"stats {RAYS} -o {{o}}/s --aois {{i}}/areas.json --cohorts {{p}}.csv",

@@ -19,23 +19,33 @@ from nerg_mi.environment.hits import (
     shade_hits,
     voxelise_hits,
 )
-from nerg_mi.environment.trained import TrainedField
+from nerg_mi.environment.planned import PlannedFiles
+from nerg_mi.environment.radiance import RadianceField
+from nerg_mi.environment.scene_loading import list_scene_files
 from nerg_mi.errors import NergError
 from nerg_mi.fields.mlp import namespace
-from nerg_mi.fields.radiance import RadianceField
+from nerg_mi.fields.radiance import RadianceNetwork
 from nerg_mi.fields.splats import Splats, concatenate_splats
 from nerg_mi.formats.fields import save_radiance
 from nerg_mi.formats.splats import write_ply_splats
 from nerg_mi.formats.surfaces import write_volume
 from nerg_mi.maths.geometry import Box, Similarity
-from nerg_mi.rays.rays import Rays
-from nerg_mi.rendering.scene import list_scene_files
+from nerg_mi.tracking.rays import Rays
 from nerg_mi.transport.geometry import trace_depth
 from nerg_mi.transport.volume_medium import VolumeMedium
 from tests.formats.splats.writers import random_splats
 from tests.refusals import mentions
 from tests.train.gaze.looks import looking_at
 from tests.train.radiance.ball import BOX, TINY
+
+# ---- Files of environments ----
+
+
+def test_a_field_is_its_only_planned_file(tmp_path):
+    (tmp_path / "field.safetensors").write_bytes(b"weights")
+    planned = PlannedFiles.plan(tmp_path / "field.safetensors")
+    assert planned.checked_path() == tmp_path / "field.safetensors" and len(planned.files.members) == 1
+
 
 # ---- Geometries of distant hit points: an office with windows, in closed form ----
 
@@ -314,7 +324,7 @@ def test_a_mesh_is_loaded_as_a_scene(rgb, tmp_path, name):
     (tmp_path / "a.obj").write_text("".join(f"v {c}\n" for c in corners) + "".join(f"f {f}\n" for f in faces))
     place = Environment.open(tmp_path / name)
     np.testing.assert_allclose([place.box.lower, place.box.upper], [[-1.02] * 3, [1.02] * 3], atol=1e-6)
-    assert place.kind == "scene" and place.metadata["scene_file"]["file"] == name
+    assert place.kind == "mesh" and place.metadata["scene_file"]["file"] == name
     assert list_scene_files(tmp_path / name) == [tmp_path / name]
 
 
@@ -329,7 +339,7 @@ def test_splat_geometry_excludes_outliers(tmp_path):
     far = Splats([[90, 0, 0]], [[1, 1, 1]], [[1, 0, 0, 0]], [0.5], np.zeros((1, 1, 3)))
     write_ply_splats(tmp_path / "a.ply", concatenate_splats([splats, far]))
     place = Environment.open(tmp_path / "a.ply")
-    assert place.kind == "field" and place.radiance is None and place.metadata["field_file"]["file"] == "a.ply"
+    assert place.kind == "splats" and place.radiance is None and place.metadata["field_file"]["file"] == "a.ply"
     assert np.allclose(place.box.upper, 1, atol=0.15) and np.allclose(place.box.lower, -1, atol=0.15)
     origin, along = np.float32([[0, 0, -3]]), np.float32([[0, 0, 1]])
     # The same geometry as in rendering.
@@ -344,7 +354,7 @@ def test_objects_are_opened_like_their_files(rgb, tmp_path):
     box.export(tmp_path / "box.ply")
     splats = random_splats(20, seed=3)
     write_ply_splats(tmp_path / "splats.ply", splats)
-    field = RadianceField.random(TINY, BOX, namespace("llvm_ad_rgb"), 0, march_step=1 / 16)
+    field = RadianceNetwork.random(TINY, BOX, namespace("llvm_ad_rgb"), 0, march_step=1 / 16)
     save_radiance(field, tmp_path / "field.safetensors", {})
     density = np.full((2, 2, 2), 8.0)
     write_volume(tmp_path / "grid.vol", density, (-1, -1, -1), (1, 1, 1))
@@ -355,7 +365,7 @@ def test_objects_are_opened_like_their_files(rgb, tmp_path):
         *((shape, "cube.xml") for shape in (box, cube, in_scene, [cube], {"a": cube}, rgb.load_dict(in_scene))),
         (str(tmp_path / "box.ply"), "cube.xml"),
         (splats, "splats.ply"),
-        *((value, "field.safetensors") for value in (field, TrainedField(field))),
+        (RadianceField(field), "field.safetensors"),
         (DensityGrid(density, (-1, -1, -1), (1, 1, 1)), "grid.vol"),
     ]
     rng = np.random.default_rng(0)
@@ -381,3 +391,11 @@ def test_files_of_rays_and_gaze_are_no_environment(tmp_path):
     looking_at(np.zeros(3), 5).save(tmp_path / "rays.npz")
     with pytest.raises(NergError, match="contains rays"):
         Environment.open(tmp_path / "rays.npz")
+
+
+def test_an_environment_describes_itself(rgb, tmp_path):
+    rgb.load_dict({"type": "cube"}).write_ply(str(tmp_path / "a.ply"))
+    assert Environment.open(tmp_path / "a.ply").description == "The mesh a.ply."
+    grid = DensityGrid(np.ones((2, 2, 2), np.float32), (0, 0, 0), (1, 1, 1))
+    assert Environment.open(grid).description == "A grid of densities, in memory."
+    assert Environment.open({"type": "cube"}).description == "The Mitsuba scene in memory."

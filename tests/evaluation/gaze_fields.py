@@ -9,7 +9,7 @@ from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.gaze_base import GazeEnsemble, make_prior_table
 from nerg_mi.fields.gaze_hits import ReaimedHits
 from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
-from nerg_mi.fields.gaze_product import GazeConfig, GazeField
+from nerg_mi.fields.gaze_product import GazeConfig, ProductHead
 from nerg_mi.formats.fields import save_gaze
 from nerg_mi.maths.geometry import Box
 from nerg_mi.maths.sphere import fibonacci_directions
@@ -36,7 +36,7 @@ def made(kind: str, box: Box, seed: int = 4, **options):
             "escaped": ns.Float(0.4)
         }
     else:
-        field = GazeField.random(
+        field = ProductHead.random(
             GazeConfig(GRID, width=16, geometry=7, sh_degree=2, normalized=kind == "normalised", **options),
             box,
             ns,

@@ -15,8 +15,8 @@ from nerg_mi.evaluation.baselines import (
     PRIOR,
     REAIMED_HITS,
     UNIFORM,
+    NearestRays,
     NeighbourDensity,
-    Neighbours,
     format_settings,
     make_prior_baseline,
     make_tuned_baselines,
@@ -24,9 +24,9 @@ from nerg_mi.evaluation.baselines import (
 )
 from nerg_mi.maths import vmf
 from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.probes.probes import compute_participant_weights
-from nerg_mi.rays.folds import iter_folds
-from nerg_mi.rays.rays import Rays
+from nerg_mi.tracking.folds import iter_folds
+from nerg_mi.tracking.probes import compute_participant_weights
+from nerg_mi.tracking.rays import Rays
 from tests.reference.kde import kde as reference
 
 X = fibonacci_directions(1024)
@@ -75,7 +75,7 @@ def test_the_prior_can_give_each_participant_the_same_weight():
 def test_neighbours_are_those_of_a_float64_reference(rays, bandwidth, is_aimed):
     hits = rays.hit.copy()
     hits[:100] = np.nan
-    neighbours = Neighbours(rays, hits if is_aimed else None)
+    neighbours = NearestRays(rays, hits if is_aimed else None)
     prior = make_prior_baseline(rays, kappa=10.0)
     settings = {"count": 300, "kappa": 20.0, "prior_weight": 0.25, "bandwidth": bandwidth}
     density = NeighbourDensity(neighbours, prior, **settings)(AT, X)
@@ -97,7 +97,7 @@ def test_neighbours_are_those_of_a_float64_reference(rays, bandwidth, is_aimed):
 
 def test_a_prior_weight_of_one_is_the_prior(rays):
     prior = make_prior_baseline(rays, kappa=10.0)
-    alone = NeighbourDensity(Neighbours(rays), prior, count=30, kappa=20.0, prior_weight=1.0)
+    alone = NeighbourDensity(NearestRays(rays), prior, count=30, kappa=20.0, prior_weight=1.0)
     assert np.array_equal(alone(AT, X), prior(AT, X))
 
 
@@ -154,7 +154,7 @@ def test_the_scores_of_the_folds_are_those_of_the_densities():
     for is_conditional, is_aimed in ((False, False), (True, False), (False, True)):
         scored = baselines._score_neighbours(train, test, at_rays(prior), is_conditional, is_aimed)
         for index in (0, len(scored.settings) // 2, len(scored.settings) - 2):
-            neighbours = Neighbours(train, train.hit if is_aimed else None)
+            neighbours = NearestRays(train, train.hit if is_aimed else None)
             density = baselines._make_neighbour_density(neighbours, prior, scored.settings[index])
             np.testing.assert_allclose(scored.log_density[index], np.log(at_rays(density)), atol=2e-3)
 

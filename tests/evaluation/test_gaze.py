@@ -17,9 +17,9 @@ from nerg_mi.evaluation.uncertainty import measure_calibration
 from nerg_mi.fields.kde import SphericalKde
 from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.probes.probes import place_probes
-from nerg_mi.rays.rays import Rays
-from nerg_mi.train.gaze_data import hold_out
+from nerg_mi.tracking.probes import place_probes
+from nerg_mi.tracking.rays import Rays
+from nerg_mi.train.gaze_folds import hold_out
 from tests.evaluation.gaze_fields import KINDS, made, saved
 from tests.plugins import fields
 from tests.plugins.scenes import camera, channels
@@ -92,7 +92,7 @@ def test_truth_is_the_probes(rays_evaluation, test_set):
 
 def test_scores_of_the_truth_and_of_the_uniform_density(test_set):
     test_set = replace(test_set, kappa=None)
-    rows = gaze.evaluate_gaze(
+    rows = gaze.score_methods(
         test_set,
         {
             "truth": lambda p, d: test_set.truth if d.ndim == 2 else np.ones(d.shape[:2]),
@@ -155,7 +155,7 @@ def test_intervals_are_a_bootstrap_over_persons():
     """
     test = by_hand(3)
     sees = lambda k: lambda p, d: test.participant_densities[:, k] if d.ndim == 2 else np.ones(d.shape[:2])
-    row, _ = gaze.evaluate_gaze(test, {"first": sees(0), "second": sees(1)}, make_uniform_baseline(), resamples=1000)
+    row, _ = gaze.score_methods(test, {"first": sees(0), "second": sees(1)}, make_uniform_baseline(), resamples=1000)
     draws = list(itertools.product(range(3), repeat=3))
     mae = [2 * (1 - draw.count(0) / 3) / (4 * np.pi) for draw in draws]
     assert row["MAE"] == pytest.approx(np.mean(mae))
@@ -169,7 +169,7 @@ def test_intervals_are_a_bootstrap_over_persons():
 
 @pytest.mark.parametrize("persons, has_interval", [(2, False), (3, True), (4, True)])
 def test_fewer_than_three_persons_have_no_interval(persons, has_interval):
-    for row in gaze.evaluate_gaze(
+    for row in gaze.score_methods(
         by_hand(persons),
         {"a": make_uniform_baseline(), "b": make_uniform_baseline()},
         make_uniform_baseline(),
@@ -202,7 +202,7 @@ def test_rays_are_also_scored_at_their_own_origins(test_set, rays_evaluation):
         hit = positions[:, None] + directions * ((1.5 - positions[:, :1]) / directions[..., 0])[..., None]
         return np.where(np.abs(hit[..., 1]) < 0.25, 2.0, 1e-3)
 
-    (row,) = gaze.evaluate_gaze(test_set, {"wall": towards_the_wall}, make_uniform_baseline(), resamples=20)
+    (row,) = gaze.score_methods(test_set, {"wall": towards_the_wall}, make_uniform_baseline(), resamples=20)
     assert row["bits at own origin"] > 0 and "bits at own origin.low" in row
     rows = gaze.score_participants(test_set, {"wall": towards_the_wall}, make_uniform_baseline())
     counts = np.bincount(test_set.own_participants)
@@ -311,7 +311,7 @@ def test_resamples_without_a_scored_ray_do_not_count(test_set):
     peaked = lambda positions, directions: np.exp(
         3 * np.broadcast_to(directions[..., 0], (len(positions), directions.shape[-2]))
     )
-    (row,) = gaze.evaluate_gaze(test, {"peaked": peaked}, make_uniform_baseline(), 40)
+    (row,) = gaze.score_methods(test, {"peaked": peaked}, make_uniform_baseline(), 40)
     # Every resample with this participant has the same mean.
     for score in (*gaze.RAY_SCORES, *gaze.OWN_SCORES):
         assert row[f"{score}.low"] == pytest.approx(row[score]) == pytest.approx(row[f"{score}.high"])
@@ -329,7 +329,7 @@ def test_intervals_of_ray_scores_resample_participants(test_set):
         3 * np.broadcast_to(directions @ peak, (len(positions), directions.shape[-2]))
     )
     prior, count, seed = make_uniform_baseline(), 40, 3
-    (row,) = gaze.evaluate_gaze(test_set, {"peaked": peaked}, prior, count, seed)
+    (row,) = gaze.score_methods(test_set, {"peaked": peaked}, prior, count, seed)
     (evaluated,) = gaze._evaluate_methods(test_set, {"peaked": peaked}, prior)
     rng, num = np.random.default_rng(seed), len(test_set.participants)
     draws = [rng.multinomial(num, np.full(num, 1 / num)) for _ in range(count)]
@@ -342,7 +342,7 @@ def test_intervals_of_ray_scores_resample_participants(test_set):
         half_width = 1.96 * np.std(resampled)
         assert row[f"{name}.high"] - row[name] == pytest.approx(half_width, rel=1e-6), name
         assert row[name] - row[f"{name}.low"] == pytest.approx(half_width, rel=1e-6), name
-    other_seed = gaze.evaluate_gaze(test_set, {"peaked": peaked}, prior, count, seed + 1)[0]
+    other_seed = gaze.score_methods(test_set, {"peaked": peaked}, prior, count, seed + 1)[0]
     assert other_seed["bits.low"] != row["bits.low"] and other_seed["KLD.low"] != row["KLD.low"]
 
 

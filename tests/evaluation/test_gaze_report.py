@@ -34,7 +34,7 @@ from nerg_mi.evaluation.gaze_report import (
 )
 from nerg_mi.evaluation.uncertainty import summarise_folds
 from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.probes.probes import REGION_LEVELS, calibrate_levels, compute_region_levels, format_level
+from nerg_mi.tracking.probes import REGION_LEVELS, calibrate_levels, compute_region_levels, format_level
 from tests.evaluation.test_gaze import crowd
 
 # ---- Output of an evaluation of gaze: cells computed by hand, valid files, and requested pictures ----

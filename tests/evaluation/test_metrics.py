@@ -10,7 +10,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.evaluation import metrics
 from nerg_mi.evaluation.metrics import FieldRenderer, compute_depth_score, score_views, ssim
 from nerg_mi.fields.encoding import HashGridConfig
-from nerg_mi.fields.radiance import RadianceConfig, RadianceField
+from nerg_mi.fields.radiance import RadianceConfig, RadianceNetwork
 from nerg_mi.formats.fields import save_radiance
 from nerg_mi.maths import vmf
 from nerg_mi.maths.geometry import Box
@@ -63,7 +63,7 @@ def fog(tmp_path):
     config = RadianceConfig(
         grid=HashGridConfig(levels=2, log2_rows=8, base=4, finest=8), width=16, color_hidden=1, density_scale=1.5
     )
-    field = RadianceField.random(config, Box((-1, -1, -1), (1, 1, 1)), ns, 0, march_step=0.05)
+    field = RadianceNetwork.random(config, Box((-1, -1, -1), (1, 1, 1)), ns, 0, march_step=0.05)
     field.set_parameters({k: type(v)(np.zeros(v.shape, np.float32)) for k, v in field.parameters().items()})
     path = tmp_path / "fog.safetensors"
     save_radiance(field, path, {})

@@ -31,7 +31,7 @@ from nerg_mi.evaluation.next_look import (
 )
 from nerg_mi.maths import vmf
 from nerg_mi.maths.sphere import aim, fibonacci_directions, sample_uniform_directions
-from nerg_mi.rays.rays import Rays
+from nerg_mi.tracking.rays import Rays
 
 TARGETS = np.array([[1.0, 0, 0], [0, 0.8, 0.6], [-0.6, 0, -0.8]])
 

@@ -13,7 +13,7 @@ import pytest
 
 from nerg_mi.evaluation import study as study_paper
 from nerg_mi.evaluation import study_scenes
-from nerg_mi.evaluation.study import RESOLUTIONS, STEP_COUNTS, count_traced_operations, list_rows
+from nerg_mi.evaluation.study import RESOLUTIONS, STEP_COUNTS, PaperMarch, count_traced_operations, list_rows
 from nerg_mi.evaluation.study_subject import open_subject
 from nerg_mi.fields.occupancy import OccupancyGrid
 from nerg_mi.transport.medium import LocalRay
@@ -64,10 +64,10 @@ def seen(rgb):
     """Map AOVs, radiance and steps to the subject and its channels with the march of the paper."""
     subject = open_subject("sphere", "auto", 24, 16)
 
-    def render(aovs, radiance=True, steps=256):
-        made = subject.make_integrator({"aovs": aovs, "radiance": radiance})
+    def render(aovs, radiance=True, **march):
+        made, march = subject.make_integrator({"aovs": aovs, "radiance": radiance}), {"steps": 256} | march
         return subject.render_channels(
-            study_paper.make_paper_integrator(made, subject.sensor, subject.tolerance, steps), 1, 1
+            study_paper.make_paper_integrator(made, subject.sensor, subject.tolerance, PaperMarch(**march)), 1, 1
         )
 
     render.subject = subject
@@ -105,11 +105,26 @@ def test_deferred_fields_evaluate_colour_once_per_ray(rgb, tmp_path):
     truth = np.array(rgb.render(scene, integrator=made, spp=1, seed=0))
     off = []
     for steps in (64, 1024):
-        paper = study_paper.make_paper_integrator(made, scene.sensors()[0], 0.01, steps)
+        paper = study_paper.make_paper_integrator(made, scene.sensors()[0], 0.01, PaperMarch(steps))
         seen = np.array(rgb.render(scene, integrator=paper, spp=1, seed=0))
         off.append(np.abs(seen - truth)[..., :3].mean())
         assert np.array_equal(seen[..., 5], seen[..., 4] > 0)
     assert truth[..., :3].max() > 0.2 and off[1] < off[0] / 4 < 0.01
+
+
+def test_corrections_of_the_papers_depth():
+    """In a slab, whose steps absorb as much as its closed form, both together leave an error of second order."""
+    subject = open_subject("slab", "auto", 12, 8)
+    truth, made = subject.get_truth(1, "expected", "depth"), subject.make_integrator()
+
+    def error(**corrections):
+        march = PaperMarch(256, **corrections)
+        integrator = study_paper.make_paper_integrator(made, subject.sensor, subject.tolerance, march)
+        depth = subject.render_channels(integrator, 1, 1)["depth"]
+        return np.abs(depth - truth.depth)[truth.opacity > 0.1].mean()
+
+    middle, opacity = {"depth_at": 0.5}, {"divides_by_opacity": True}
+    assert error(**middle, **opacity) < 0.3 * min(error(), error(**middle), error(**opacity))
 
 
 @pytest.mark.parametrize("dt_gamma", [0.0, 0.05])
@@ -133,8 +148,9 @@ def test_skipping_empty_cells_changes_nothing(dt_gamma):
     # The coarse grid of a refined grid.
     for occupancy in (grid, SimpleNamespace(coarse=grid), None):
         medium = SimpleNamespace(occupancy=occupancy, to_unit=lambda p: p, vector_to_unit=lambda v: v, density=density)
-        how = {"steps": 4096, "min_step": step, "max_step": 0.02, "dt_gamma": dt_gamma}
-        alpha, depth, _, n = study_paper.march_as_in_paper(medium, ray, t0, t1, True, None, **how)
+        medium.length_scale = 600 * step
+        march = PaperMarch(600, dt_gamma)
+        alpha, depth, _, n = study_paper.march_as_in_paper(medium, ray, t0, t1, True, None, march)
         result.append([np.array(v, float) for v in (alpha, depth, n)])
     leaping, refining, complete = result
     assert all(np.array_equal(a, b) for a, b in zip(leaping, refining))
@@ -160,7 +176,11 @@ def test_the_papers_depth_is_unnormalised_and_at_the_steps_end():
     steps = 64
     step = subject.extent / steps
     seen = subject.render_channels(
-        study_paper.make_paper_integrator(subject.make_integrator(), subject.sensor, subject.tolerance, steps), 1, 1
+        study_paper.make_paper_integrator(
+            subject.make_integrator(), subject.sensor, subject.tolerance, PaperMarch(steps)
+        ),
+        1,
+        1,
     )
     for i in range(0, len(o), 7):
         hit = march_numpy.box(o[i], d[i], (0, 0, 0), (1, 1, 1))

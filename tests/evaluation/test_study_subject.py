@@ -8,15 +8,13 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.evaluation import study, study_scenes, study_subject
+from nerg_mi.evaluation import study, study_run, study_scenes, study_subject
 from nerg_mi.evaluation import study_truth as study_shapes
 from nerg_mi.evaluation.study_subject import open_subject, read_parameters
 from nerg_mi.fields.compilation import bound_voxel_bytes
 from nerg_mi.maths.geometry import Box
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.train.gaze_data import compute_box_exit
-from nerg_mi.workflows.scene_commands import StudyOptions
-from nerg_mi.workflows.study import find_reference_scene, run_study
 from tests.evaluation.gaze_fields import KINDS, saved
 from tests.plugins import fields
 from tests.reference import march_numpy
@@ -81,7 +79,7 @@ def test_the_twin_has_exact_visibility(rgb, tmp_path):
     eye = np.array([-2.0, -1.0, 3.0])
     (tmp_path / "scene.xml").write_text(SCENE.format(eye=", ".join(map(str, eye))))
     (tmp_path / "twin.xml").write_text(TWIN)
-    subject = open_subject(str(tmp_path / "scene.xml"), "auto", 24, 16, surfaces=find_reference_scene)
+    subject = open_subject(str(tmp_path / "scene.xml"), "auto", 24, 16, surfaces=study_run.find_reference_scene)
     assert np.allclose(subject.observer_position(), eye)
     t, visible = subject.find_exact_hits(1)
     o, d = subject.record_rays(1)
@@ -244,8 +242,7 @@ def test02_the_integral_is_that_of_exact_geometry(rgb, tmp_path, kind):
 def test03_the_study_of_a_default_recipe(rgb, tmp_path, shapes):
     path = scene(tmp_path, "default recipe", shapes)
     only = "transmittance" if shapes else "paper, 64 steps$|jitter"
-    options = StudyOptions(width=12, height=8, quick=True, only=only, mode="llvm_ad_rgb")
-    report = run_study(path, tmp_path / "out", options).report
+    report = study_run.study(path, width=12, height=8, quick=True, only=only).report
     rows = {r["setting"]: r for r in report["rows"]}
     assert len(rows) >= 2 and all(r["gaze_mae"] < 0.05 and np.isfinite(r["gaze_kld"]) for r in rows.values())
     assert rows["default"]["gaze_mae"] < 1e-3
@@ -254,12 +251,13 @@ def test03_the_study_of_a_default_recipe(rgb, tmp_path, shapes):
 @pytest.mark.parametrize("kind", ["default recipe", "ensemble"])
 def test04_the_papers_marching_is_divided_by_the_same_integral(rgb, tmp_path, kind):
     """In an opaque box both marches find the same surfaces, so their densities are equal."""
-    from nerg_mi.evaluation.study import make_paper_integrator
+    from nerg_mi.evaluation.study import PaperMarch, make_paper_integrator
 
     subject = open_subject(str(scene(tmp_path, kind, False)), "auto", 24, 16)
     made = subject.make_integrator({"aovs": "depth,opacity,gaze,visibility,gaze_evals", "depth": "expected"})
     # First, because afterwards the field would face the observer with any march.
-    theirs = subject.render_channels(make_paper_integrator(made, subject.sensor, subject.tolerance, 4096), 1, 1)
+    march = PaperMarch(4096)
+    theirs = subject.render_channels(make_paper_integrator(made, subject.sensor, subject.tolerance, march), 1, 1)
     ours = subject.render_channels(made, 1, 1)
     both = (ours["visibility"] > 0.8) & (theirs["visibility"] > 0.8) & (ours["opacity"] > 0.99)
     assert both.sum() > 10

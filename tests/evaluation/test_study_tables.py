@@ -90,7 +90,9 @@ def test_cost_is_drawn_over_named_axes_with_the_exponent(drawn):
 def test_missing_values_have_a_reason(monkeypatch, tmp_path):
     monkeypatch.setattr(study_tables, "format_report", lambda report: "")
     table = [dict.fromkeys(study_tables.COLUMNS, 1.0), {"setting": "gaze only", "gaze_mae": 0.1}]
-    paths = study_tables.write_tables(tmp_path, {"rows": table, "scaling": SCALING})
+    report = {"rows": table, "scaling": SCALING}
+    study_tables.add_row_notes(report)
+    paths = study_tables.write_tables(tmp_path, report)
     with open(paths[0], encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     assert not find_wrong_notes(rows) and [bool(row["note"]) for row in rows] == [False, True]
@@ -154,3 +156,5 @@ def test_comparison_with_the_paper_selects_the_best_rows():
         assert first["equal_time"]["setting"] == "default" and math.isclose(first["equal_time"]["error_ratio"], 5)
         assert first["equal_error"]["setting"] == "short" and math.isclose(first["equal_error"]["time_ratio"], 4)
         assert second["equal_time"] is None and second["equal_error"] is None
+        # The map is no candidate.
+        assert first["settings"] == second["settings"] == 3

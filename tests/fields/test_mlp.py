@@ -13,9 +13,9 @@ from nerg_mi.fields import mlp
 from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.gaze_base import GazeEnsemble
 from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
-from nerg_mi.fields.gaze_product import GazeConfig, GazeField
+from nerg_mi.fields.gaze_product import GazeConfig, ProductHead
 from nerg_mi.fields.mlp import MLP, evaluate_with_constants, is_cuda, namespace, set_constant_weights
-from nerg_mi.fields.radiance import RadianceConfig, RadianceField
+from nerg_mi.fields.radiance import RadianceConfig, RadianceNetwork
 from nerg_mi.maths.geometry import Box
 from nerg_mi.transport.jit import gc_paused
 from tests.reference import fields_numpy as reference
@@ -183,13 +183,13 @@ def gaze_log(seed=0):
 
 
 def radiance():
-    return RadianceField.random(RadianceConfig(grid=GRID, width=16), BOX, ns)
+    return RadianceNetwork.random(RadianceConfig(grid=GRID, width=16), BOX, ns)
 
 
 def said_by(field):
     """All results of evaluations (rows of numbers)."""
     p, d = points(), directions()
-    if isinstance(field, RadianceField):
+    if isinstance(field, RadianceNetwork):
         sigma, features = field.density_features(p)
         return np.array([sigma, field.density(p), *features, *field.color(features, d)])
     return np.array(field.unnormalized(p, p * 0.5, d) if field.config.normalized else field.evaluate(p, p * 0.5, d))
@@ -207,7 +207,7 @@ def unrolled(monkeypatch):
     return result
 
 
-@pytest.mark.parametrize("make", [radiance, gaze_log, lambda: GazeField.random(GazeConfig(grid=GRID), BOX, ns)])
+@pytest.mark.parametrize("make", [radiance, gaze_log, lambda: ProductHead.random(GazeConfig(grid=GRID), BOX, ns)])
 def test01_fields_are_bit_identical(make, unrolled):
     field = make()
     before = said_by(field)

@@ -13,7 +13,7 @@ from nerg_mi.fields.radiance import (
     Background,
     BackgroundConfig,
     RadianceConfig,
-    RadianceField,
+    RadianceNetwork,
     color_network_inputs,
     decode_color,
     density_from_log,
@@ -142,7 +142,7 @@ BOX = Box((-1, 0, 2), (3, 2, 4))
 
 
 def make(seed=0, config=RADIANCE_CONFIG, **kwargs):
-    field = RadianceField.random(config, BOX, ns, seed, **kwargs)
+    field = RadianceNetwork.random(config, BOX, ns, seed, **kwargs)
     # Features of order one; otherwise every output would be that of zero input.
     rng = np.random.default_rng(seed)
     field.set_parameters({"grid.table": ns.Float(rng.normal(size=len(field.grid.table)).astype(np.float32))})

@@ -12,7 +12,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.fields.compilation import compile_density, occupancy_of_voxels
 from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid
-from nerg_mi.fields.radiance import RadianceConfig, RadianceField
+from nerg_mi.fields.radiance import RadianceConfig, RadianceNetwork
 from nerg_mi.fields.voxels import BLOCK_EDGE, CELLS, VERTICES, VoxelArrays, VoxelGrid
 from nerg_mi.formats.fields import load_radiance, save_radiance
 from nerg_mi.maths.arrays import to_vector
@@ -146,7 +146,7 @@ CONFIG = RadianceConfig(
 
 def make_field(box=BOX, scale=1.0, offset=0.0, seed=0, occupancy=None, **kwargs):
     """A random field whose log density varies by several units; ``offset`` is added to it."""
-    field = RadianceField.random(
+    field = RadianceNetwork.random(
         replace(CONFIG, density_scale=float(np.exp(offset))), box, ns, seed, march_step=scale * 0.05, **kwargs
     )
     rng = np.random.default_rng(seed)

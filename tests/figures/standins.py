@@ -32,10 +32,10 @@ def write_standins(folder: Path) -> dict[str, str]:
     import mitsuba as mi
 
     from nerg_mi.fields.encoding import HashGridConfig
-    from nerg_mi.fields.gaze_product import GazeConfig, GazeField
+    from nerg_mi.fields.gaze_product import GazeConfig, ProductHead
     from nerg_mi.fields.mlp import namespace
     from nerg_mi.fields.occupancy import OccupancyGrid
-    from nerg_mi.fields.radiance import RadianceConfig, RadianceField
+    from nerg_mi.fields.radiance import RadianceConfig, RadianceNetwork
     from nerg_mi.formats.fields import save_gaze, save_radiance
     from nerg_mi.maths.geometry import Box
 
@@ -43,8 +43,8 @@ def write_standins(folder: Path) -> dict[str, str]:
     grid = HashGridConfig(levels=4, log2_rows=12, base=4, finest=24)
     config = RadianceConfig(grid=grid, width=16, color_hidden=1, density_scale=100.0)
     occupancy = OccupancyGrid(solid_cells(), ns, 1.0)
-    radiance = RadianceField.random(config, box, ns, 1, occupancy=occupancy, march_step=0.05)
-    gaze = GazeField.random(GazeConfig(grid=grid, width=16), box, ns, 2)
+    radiance = RadianceNetwork.random(config, box, ns, 1, occupancy=occupancy, march_step=0.05)
+    gaze = ProductHead.random(GazeConfig(grid=grid, width=16), box, ns, 2)
     for field in (radiance, gaze):
         table = field.parameters()["grid.table"]
         field.set_parameters({"grid.table": table * float(1 / np.abs(table.numpy()).max())})

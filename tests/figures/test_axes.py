@@ -10,14 +10,15 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from nerg_mi.aoi import charts
 from nerg_mi.errors import NergError
-from nerg_mi.figures import maps, overlay, statistics
+from nerg_mi.figures import maps, overlay
 from nerg_mi.figures.overlay import Heat
 from nerg_mi.figures.scanpath import scanpath_figure
 from nerg_mi.figures.sphere import sphere_figure
 from nerg_mi.figures.style import contact_sheet, encode, figure_of, rasterize
 from nerg_mi.figures.training import psnr_figure
-from nerg_mi.rays.rays import Rays
+from nerg_mi.tracking.rays import Rays
 
 H, W = 30, 48
 COLOR, MASK = np.full((H, W, 3), 0.2), np.ones((H, W), bool)
@@ -50,8 +51,8 @@ FIGURES = {
     "floor": (1, lambda **how: maps.floor_figure(np.zeros(2), np.ones(2), **how)),
     "plan": (1, lambda **how: maps.floor_plan(rays(), **how)),
     "layout": (1, lambda **how: maps.layout_figure(rays(), rays(), POINTS[:3], 0.1, **how)),
-    "aois": (3, lambda **how: statistics.aois_figure(ROWS, **how)),
-    "transitions": (1, lambda **how: statistics.transitions_figure("ab", np.eye(2), **how)),
+    "aois": (3, lambda **how: charts.aois_figure(ROWS, **how)),
+    "transitions": (1, lambda **how: charts.transitions_figure("ab", np.eye(2), **how)),
     "psnr": (1, lambda **how: psnr_figure([{"steps": 1, "seconds": 1.0, "psnr": 20.0}], **how)),
 }
 

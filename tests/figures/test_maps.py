@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.collections import LineCollection, PatchCollection
 
+from nerg_mi.aoi.charts import aois_figure, transitions_figure
 from nerg_mi.figures.maps import (
     PARTICIPANT_COLORS,
     ParticipantPath,
@@ -17,9 +18,8 @@ from nerg_mi.figures.maps import (
     floor_plan,
     layout_figure,
 )
-from nerg_mi.figures.statistics import aois_figure, transitions_figure
 from nerg_mi.figures.style import DPI, encode, figure_of, rasterize, save
-from nerg_mi.rays.rays import Rays
+from nerg_mi.tracking.rays import Rays
 
 # ---- Alignment figures ----
 

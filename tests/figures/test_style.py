@@ -41,7 +41,6 @@ from nerg_mi.figures.style import (
     shrink,
     wrap,
 )
-from nerg_mi.workflows.scene_commands import BakeOptions, PictureOptions
 
 # ---- Colour maps ----
 
@@ -127,17 +126,14 @@ def test_provenance_is_complete(tmp_path):
 
 
 def test_provenance_excludes_users_and_paths(tmp_path):
-    options = BakeOptions(store=tmp_path, scheduler="local:2", max_edge=0.5, seed=4)
-    assert dict(make_provenance("x", [], 4, options).settings) == {"max_edge": 0.5}
+    options = {"store": tmp_path, "scheduler": "local:2", "spp": 5, "seed": 4}
+    assert dict(make_provenance("x", [], 4, options).settings) == {"spp": 5}
 
 
 def test_no_path_of_the_machine(tmp_path):
     (tmp_path / "a.csv").write_text("x")
-    options = PictureOptions(
-        frames=tmp_path / "a.csv",
-        defaults={"field": f"{tmp_path}/deep/f.safetensors", "w": r"C:\Users\me\b.ply"},
-        spp=2,
-    )
+    defaults = {"field": f"{tmp_path}/deep/f.safetensors", "w": r"C:\Users\me\b.ply"}
+    options = {"frames": tmp_path / "a.csv", "defaults": defaults, "spp": 2}
     text = json.dumps(make_provenance("x", [tmp_path / "a.csv"], 0, options).text())
     assert str(tmp_path) not in text and "Users" not in text and str(Path.home()) not in text
     settings = make_provenance("x", [], 0, options).settings

@@ -87,7 +87,7 @@ import sys
 import nerg_mi, mitsuba as mi, drjit as dr
 mi.set_variant("llvm_ad_rgb")
 dr.set_thread_count(1)
-from nerg_mi.rendering.scene import load_scene
+from nerg_mi.environment.scene_loading import load_scene
 load_scene(sys.argv[1])
 assert dr.thread_count() == 1
 """

@@ -34,7 +34,7 @@ from nerg_mi.files.safe_read import (
     sanitize,
     translate_read_errors,
 )
-from nerg_mi.formats.areas import Region
+from nerg_mi.formats.boxes import Region
 from nerg_mi.formats.meshes import read_mesh_file
 from nerg_mi.photos.colmap import read_image_poses
 
@@ -138,6 +138,19 @@ def test_mapped_files_need_magic(tmp_path):
             out.truncate(size)
             with pytest.raises(NergError, match='"ply"'):
                 map_bytes(tmp_path / "a", "mesh", 1 << 40, b"ply", "export it again")
+
+
+@pytest.mark.parametrize(
+    "reason, end",
+    [
+        ("its triangles are compressed; export it without compression", "compressed; export it without compression"),
+        ("it has 7 bytes; the limit is 6", "the limit is 6; export it again"),
+    ],
+)
+def test_one_remedy(tmp_path, reason, end):
+    with pytest.raises(NergError) as error, safe_read.translate_read_errors(tmp_path / "a", "mesh", "export it again"):
+        raise ValueError(reason)
+    assert str(error.value).endswith(end)
 
 
 def test_json_equals_json_module(tmp_path):
@@ -604,6 +617,27 @@ def test_message_of_python_is_no_message_of_a_file(act, word):
         act()
     cause = error.value.__cause__
     assert isinstance(cause, KeyError) or str(cause) not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "head, content",
+    [
+        (b"PK\x03\x04", "Excel workbook"),
+        (b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", "Excel workbook"),
+        (b"PAR1", "Parquet"),
+        (b"SQLite format 3\0", "database"),
+        (b"\x1f\x8b", "gzip"),
+    ],
+)
+def test_content_of_another_kind_is_named(tmp_path, head, content):
+    path = tmp_path / "a.csv"
+    path.write_bytes(head + b"\xff" * 40)
+    with pytest.raises(NergError, match=content):
+        list(read_line_blocks(path, "table", 9))
+    # A file that is of this kind by its name is only damaged.
+    path = path.rename(tmp_path / "a.npz")
+    with pytest.raises(NergError, match="damaged"), translate_read_errors(path):
+        raise ValueError("it is damaged")
 
 
 def test_message_of_a_reader_is_kept():

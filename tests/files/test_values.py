@@ -141,7 +141,18 @@ def test_spaces_of_any_kind_around_names_do_not_count(name):
 def test_tensors_with_derivatives_are_numbers():
     torch = pytest.importorskip("torch")
     tensor = torch.tensor([[1.0, 2.0]], requires_grad=True)
-    np.testing.assert_allclose(to_numbers(tensor, "origins"), [[1, 2]])
+    for values in (tensor, tensor.bfloat16()):
+        np.testing.assert_allclose(to_numbers(values, "origins"), [[1, 2]])
+
+
+def test_iterators_are_read_once():
+    assert to_numbers((x for x in (1, 2)), "origins").tolist() == [1, 2]
+    assert to_seconds({"a": 1.5}.values(), "times").tolist() == [1.5]
+    assert to_names(iter(["a", "b"]), "participants").tolist() == ["a", "b"]
+
+
+def test_one_number_has_no_rows():
+    assert to_numbers(3.0, "origins").shape == to_seconds(np.float32(3), "times").shape == ()
 
 
 def test_numbers_keep_their_shape_and_type():

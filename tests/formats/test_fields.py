@@ -13,10 +13,10 @@ from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.gaze_base import max_sizes_of
 from nerg_mi.fields.gaze_hits import ReaimedHits
 from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
-from nerg_mi.fields.gaze_product import GazeConfig, GazeField
+from nerg_mi.fields.gaze_product import GazeConfig, ProductHead
 from nerg_mi.fields.mlp import MLP
 from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid, cascades_from_contracted
-from nerg_mi.fields.radiance import RadianceConfig, RadianceField
+from nerg_mi.fields.radiance import RadianceConfig, RadianceNetwork
 from nerg_mi.formats.checkpoint import read_checkpoint, write_checkpoint
 from nerg_mi.formats.fields import (
     MAX_GRID_RESOLUTION,
@@ -34,7 +34,7 @@ from nerg_mi.formats.fields import (
     translate_build_errors,
 )
 from nerg_mi.maths.geometry import Box, ContractedBox
-from nerg_mi.rays.rays import Rays
+from nerg_mi.tracking.rays import Rays
 from tests.conftest import ROOT
 from tests.evaluation import gaze_fields
 
@@ -187,7 +187,7 @@ BOX = Box((-1, 0, 2), (3, 2, 4))
 
 def make_radiance(resolution=5):
     bits = np.random.default_rng(0).random((resolution,) * 3) < 0.2
-    return RadianceField.random(
+    return RadianceNetwork.random(
         RadianceConfig(FIELDS_GRID, width=16, color_hidden=1, geometry=3, sh_degree=2, density_scale=7.0),
         BOX,
         ns,
@@ -199,7 +199,7 @@ def make_radiance(resolution=5):
 
 
 def make_gaze():
-    return GazeField.random(GazeConfig(FIELDS_GRID, "capture", "exp", width=16, geometry=3, sh_degree=3), BOX, ns, 2)
+    return ProductHead.random(GazeConfig(FIELDS_GRID, "capture", "exp", width=16, geometry=3, sh_degree=3), BOX, ns, 2)
 
 
 def arrays(field):
@@ -237,7 +237,7 @@ def test02_optional_parts_of_radiance_fields(tmp_path):
     p = ns.Array3f(1, 1, 3)
     assert field.density(p).numpy()[0] == again.density(p).numpy()[0] > 0
     save_radiance(
-        RadianceField.random(RadianceConfig(FIELDS_GRID, width=16, deferred=True), BOX, ns), tmp_path / "f", {}
+        RadianceNetwork.random(RadianceConfig(FIELDS_GRID, width=16, deferred=True), BOX, ns), tmp_path / "f", {}
     )
     again, _ = load_radiance(tmp_path / "f", ns)
     assert again.occupancy is None and again.march_step is None and again.color_space == "srgb"
@@ -381,7 +381,7 @@ def test_cascades_that_float32_cannot_address_are_refused():
 
 def test_contracted_box_round_trips(tmp_path):
     box, r = ContractedBox(Box((-1, 0, 2), (3, 2, 4)), 8), 8
-    field = RadianceField.random(
+    field = RadianceNetwork.random(
         RadianceConfig(FIELDS_GRID, width=16, color_hidden=1, geometry=3, sh_degree=2),
         box,
         ns,
@@ -397,7 +397,7 @@ def test_contracted_box_round_trips(tmp_path):
     assert np.array_equal(again.occupancy.bits, field.occupancy.bits) and again.occupancy.bound == 8
     p = ns.Array3f(np.random.default_rng(1).uniform(-14, 14, (3, 100)).astype(np.float32))
     assert np.array_equal(again.density(p).numpy(), field.density(p).numpy())
-    attention = GazeField.random(GazeConfig(FIELDS_GRID, width=16, geometry=3, sh_degree=3), box, ns, 2)
+    attention = ProductHead.random(GazeConfig(FIELDS_GRID, width=16, geometry=3, sh_degree=3), box, ns, 2)
     save_gaze(attention, path, {})
     assert load_gaze(path, ns)[0].box == box
 

@@ -209,6 +209,17 @@ def test_damaged_ply_is_refused(tmp_path, old, new, said):
     assert "a.ply" in str(error.value)
 
 
+def test_compressed_ply_is_recognised_and_refused(tmp_path):
+    """As SuperSplat writes it: chunks, which a reader of meshes would not expect, come first."""
+    packed = ("position", "rotation", "scale", "color")
+    lines = ["ply", "format binary_little_endian 1.0", "element chunk 1", "property float min_x", "element vertex 1"]
+    lines += [*(f"property uint packed_{name}" for name in packed), "end_header\n"]
+    (tmp_path / "a.ply").write_bytes("\n".join(lines).encode() + bytes(20))
+    assert is_splat_file(tmp_path / "a.ply")
+    with pytest.raises(NergError, match="a.ply.*compressed.*splat-transform in.ply out.ply$"):
+        read_ply_splats(tmp_path / "a.ply")
+
+
 def test_text_ply_is_limited(tmp_path, monkeypatch):
     write_inria(tmp_path / "a.ply", random_splats(), "ascii")
     monkeypatch.setattr(ply_tables, "MAX_TEXT_BYTES", 100)

@@ -13,7 +13,7 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid
-from nerg_mi.fields.radiance import RadianceConfig, RadianceField
+from nerg_mi.fields.radiance import RadianceConfig, RadianceNetwork
 from nerg_mi.formats.fields import load_gaze, load_radiance, save_gaze, save_radiance
 from nerg_mi.formats.torch_files import write_torch
 from nerg_mi.formats.torch_ngp import (
@@ -190,7 +190,7 @@ def test10_grid_of_other_resolution(tmp_path):
     ],
 )
 def test11_unrepresentable_fields_are_refused(tmp_path, config, box, said):
-    field = RadianceField.random(config, box, ns)
+    field = RadianceNetwork.random(config, box, ns)
     with pytest.raises(ValueError, match=f"cannot represent this field: {said}"):
         make_torch_ngp(field).save(tmp_path / "x.pth")
     assert not list(tmp_path.iterdir())

@@ -24,13 +24,13 @@ def _parts():
 def _make_radiance(folder: Path) -> None:
     from nerg_mi.fields.encoding import HashGridConfig
     from nerg_mi.fields.occupancy import OccupancyGrid
-    from nerg_mi.fields.radiance import Background, BackgroundConfig, RadianceConfig, RadianceField
+    from nerg_mi.fields.radiance import Background, BackgroundConfig, RadianceConfig, RadianceNetwork
     from nerg_mi.formats.fields import save_radiance
 
     ns, box, grid = _parts()
     config = RadianceConfig(grid, width=4, color_hidden=1, geometry=3, sh_degree=2)
     behind = BackgroundConfig(8.0, HashGridConfig(levels=1, log2_rows=3, base=2, finest=4, dimensions=2), 4, 1, 2)
-    field = RadianceField.random(
+    field = RadianceNetwork.random(
         config,
         box,
         ns,
@@ -51,11 +51,11 @@ def _read_radiance(folder: Path) -> object:
 def _gaze(kind: str):
     from nerg_mi.fields.gaze_base import GazeEnsemble, RaySupport
     from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
-    from nerg_mi.fields.gaze_product import GazeConfig, GazeField
+    from nerg_mi.fields.gaze_product import GazeConfig, ProductHead
 
     ns, box, grid = _parts()
     if kind == "product":
-        return GazeField.random(GazeConfig(grid, width=4, geometry=3, sh_degree=2, trunk="layernorm"), box, ns, 2)
+        return ProductHead.random(GazeConfig(grid, width=4, geometry=3, sh_degree=2, trunk="layernorm"), box, ns, 2)
     one = lambda seed: LogGazeField.random(LogGazeConfig(grid, width=4, layers=1, sh_degree=2, prior=2), box, ns, seed)
     field = one(1) if kind == "log" else GazeEnsemble([one(1), one(2)])
     field.support = RaySupport.from_origins(np.random.default_rng(0).random((9, 3)), 0.5)
@@ -151,7 +151,7 @@ def _read_radiance_run(folder: Path) -> object:
 
 
 def _make_gaze_run(folder: Path) -> None:
-    from nerg_mi.train.gaze_trainer import GazeFit, GazeRunFile
+    from nerg_mi.train.gaze_run import GazeFit, GazeRunFile
     from nerg_mi.train.trainer import Trainer
 
     trainer, fit = _trainer(Trainer), GazeFit(best_step=2, schedule=5)
@@ -159,7 +159,7 @@ def _make_gaze_run(folder: Path) -> None:
 
 
 def _read_gaze_run(folder: Path) -> object:
-    from nerg_mi.train.gaze_trainer import GazeRunFile
+    from nerg_mi.train.gaze_run import GazeRunFile
     from nerg_mi.train.trainer import Trainer
 
     file = GazeRunFile(folder / "gaze.run", _METADATA, resume=True)

@@ -31,11 +31,11 @@ SKIPPED = {"demo", "study", "eval folds", "export torch-ngp", "refine"}
 SKIPPED |= set() if outputs.HAS_TORCH else set(outputs.OF_TORCH)
 """Commands that take many seconds at any setting, or have no options."""
 
-FIXED = set("-o --output --mode --variant --store --scheduler --help --threads --hosts --workers".split())
+FIXED = set("-o --output --mode --variant --store --scheduler --help --threads".split())
 """Options that are not varied: outputs, variants, and where work is done."""
 
-_WORK = "steps minutes spp resamples resolution samples directions probes ensemble width height texture pictures angle"
-_WORK += " observers eyes points detail cell step voxel count views rays downscale scale cone positions fps bundle gaze"
+_WORK = "steps minutes spp resamples resolution ensemble width height texture-size max-angle max-edge cone scale fps"
+_WORK += " views viewpoints num-rays num-views num-frames repeats folds rays gaze"
 WORK = {"--" + name for name in _WORK.split()}
 """Options whose value is an amount of work: any in their range may be meant in earnest, and take hours. A line with one
 is interrupted after `PATIENCE` seconds of the processor, and must end then; others must be done within `LIMIT`."""
@@ -44,7 +44,7 @@ PATIENCE, LIMIT = 4.0, 20.0
 
 _FILES = dict(field="field.safetensors", gaze="gaze.safetensors", scene="ball.xml", surface="room.ply", rays="rays.npz")
 _FILES |= dict(areas="areas.json", pairs="pairs.csv", frames="frames.csv", photos="photos", views="photos")
-_FILES |= dict(align="align.json", align_views="align.json", geometry="gaze.vol", test="rays.npz")
+_FILES |= dict(align="align.json", align_views="align.json", test="rays.npz")
 """Parameter of a command -> an input of the kind that it reads."""
 _WRITTEN = {("import", "gaze"), ("export volume", "color"), ("eval radiance", "json_file")}
 
@@ -56,12 +56,18 @@ _REFUSED = {
 }
 """Type of an option -> values of which most are refused."""
 
-_TEXTS = dict(define=("level=0.5", "spp=1"), source=("field", "rays"), geometry=("hits", "none"), photo=("0", "3.png"))
-_TEXTS |= dict(person=("a", "b"), people=("a", "a,b"), persons=("a", "b"), without_persons=("a", "b"))
-_TEXTS |= dict(
-    recipe=load_recipes(), salience=("spectral-residual",), semantic=("accumulated", "snapshot"), windows=("w=0:1",)
+_TEXTS = dict(
+    defaults=("level=0.5", "spp=1"),
+    observers=("0,0,1.6", "1,1,1.6"),
+    person=("a", "b"),
+    persons=("a", "b"),
+    photo=("0", "3.png"),
+    recipe=load_recipes(),
+    salience=("spectral-residual",),
+    source=("field", "rays"),
+    windows=("w=0,1",),
+    without_persons=("a", "b"),
 )
-_TEXTS |= dict(observers=("0,0,1.6", "1,1,1.6"), begin=("random", "field"))
 """Parameter of a command -> values that its help does not enumerate."""
 _POINTS = ("0.5,1.2,1.6", f"{COORDINATES.low},0,{COORDINATES.high}", "1e-7,0,0", "-2,-2,-2", "0,0,1")
 _SPANS = ("0,2", "0,0", f"{TIMES.low},{TIMES.high}", "1.5,1.5000001")
@@ -144,7 +150,7 @@ def check_outputs(folder: Path, printed: str) -> None:
     import mitsuba as mi
     from safetensors.numpy import load_file
 
-    from nerg_mi.rays.rays import Rays
+    from nerg_mi.tracking.rays import Rays
 
     files = [path for path in folder.rglob("*") if path.is_file()]
     wrong = [path.name for path in files if not path.stat().st_size]

@@ -63,7 +63,7 @@ def _read(folder: Path) -> object:
     import mitsuba as mi
 
     import nerg_mi  # noqa: F401
-    from nerg_mi.rendering.scene import load_scene
+    from nerg_mi.environment.scene_loading import load_scene
 
     if mi.variant() != "llvm_ad_rgb":
         mi.set_variant("llvm_ad_rgb")
@@ -72,12 +72,12 @@ def _read(folder: Path) -> object:
 
 
 def _nest(folder: Path) -> object:
-    from nerg_mi.rendering.nested_scene import nest_scene
-    from nerg_mi.rendering.scene_writer import GazeFiles, LookAt, SceneText
+    from nerg_mi.environment.nested_scene import nest_scene
+    from nerg_mi.environment.scene_writer import GazeFiles, LookAt, SceneText
 
-    place = nest_scene(folder / "theirs.xml", folder / "ours")
+    place = nest_scene(folder / "theirs.xml")
     camera = LookAt(np.zeros(3), np.ones(3))
-    return SceneText(place, GazeFiles(), camera, None, np.array([0.0, 0, 1])).to_xml()
+    return SceneText(place, GazeFiles(), camera, None, np.array([0.0, 0, 1])).to_xml(folder / "ours")
 
 
 def _make_nested(folder: Path) -> None:
@@ -102,14 +102,8 @@ def _make_regions(folder: Path) -> None:
     (folder / "areas.json").write_text(text)
 
 
-def _read_regions(folder: Path) -> object:
-    from nerg_mi.formats.areas import read_regions
-
-    return read_regions(folder / "areas.json")
-
-
 def _read_frames(folder: Path) -> object:
-    from nerg_mi.rendering.files import read_frames
+    from nerg_mi.environment.rendering_files import read_frames
 
     return read_frames(folder / "walk.frames.csv")
 
@@ -141,7 +135,7 @@ def _make_path(folder: Path) -> None:
 
 
 def _read_path(folder: Path) -> object:
-    from nerg_mi.workflows.bake_chunks import read_observer_file
+    from nerg_mi.surfaces.bake_parts import read_observer_file
 
     return read_observer_file(folder / "walk.csv")
 
@@ -157,7 +151,6 @@ SCENES = [
     _reader("a.obj", "text"),
     _reader("fog.vol"),
     Reader("scene to be nested", _make_nested, {"theirs.xml": ("text",), "more.xml": ("text",)}, _nest),
-    Reader("areas of interest", _make_regions, {"areas.json": ("json",)}, _read_regions),
     Reader("mesh of glTF", _make_glb, {"a.glb": (), "document.json": ("json",)}, _read_glb),
     Reader("path of observers", _make_path, {"walk.csv": ("text",)}, _read_path),
     Reader("frames of a sequence", _make_frames, {"walk.frames.csv": ("text",)}, _read_frames),
@@ -180,9 +173,9 @@ def _make_areas(folder: Path) -> None:
 
 
 def _read_areas(folder: Path) -> object:
-    from nerg_mi.formats.areas import read_areas
+    from nerg_mi.aoi.areas import Areas
 
-    areas = read_areas(folder / "areas.json")
+    areas = Areas.load(folder / "areas.json")
     assert all(elements for elements in areas.box_indices.values())
     for box in areas.boxes:
         box.contains(areas.boxes[0].vertices if areas.boxes else [[0.0, 0, 0]])
@@ -190,15 +183,15 @@ def _read_areas(folder: Path) -> object:
 
 
 def _make_twin(folder: Path) -> None:
-    from tests.formats.test_areas import write_twin
+    from tests.formats.test_boxes import write_twin
 
     write_twin(folder / "twin")
 
 
 def _read_twin(folder: Path) -> object:
-    from nerg_mi.formats.areas import read_areas
+    from nerg_mi.aoi.areas import Areas
 
-    return read_areas(folder / "twin").boxes
+    return Areas.load(folder / "twin").boxes
 
 
 def _make_changes(folder: Path) -> None:
@@ -214,12 +207,11 @@ def _make_changes(folder: Path) -> None:
 
 
 def _read_changes(folder: Path) -> object:
-    from nerg_mi.aoi.scene import apply_to_areas, read_changes
-    from nerg_mi.formats.areas import AreaSet, Region
+    from nerg_mi.aoi.areas import Areas
+    from nerg_mi.aoi.changes import apply_to_areas, read_changes
+    from nerg_mi.formats.boxes import Region
 
-    return apply_to_areas(
-        AreaSet((Region.create("shelf", [0, 0, 0], [1, 1, 1]),)), read_changes(folder / "changes.json")
-    )
+    return apply_to_areas(Areas((Region.create("shelf", [0, 0, 0], [1, 1, 1]),)), read_changes(folder / "changes.json"))
 
 
 def _make_cohorts(folder: Path) -> None:
@@ -227,12 +219,13 @@ def _make_cohorts(folder: Path) -> None:
 
 
 def _read_cohorts(folder: Path) -> object:
-    from nerg_mi.aoi.scene import read_cohorts
+    from nerg_mi.aoi.measured import read_cohorts
 
     return read_cohorts(folder / "cohorts.csv")
 
 
 AREAS = [
+    Reader("boxes", _make_regions, {"areas.json": ("json",)}, _read_areas),
     Reader("areas of every kind", _make_areas, {"areas.json": ("json",)}, _read_areas),
     Reader(
         "objects of a twin",
@@ -279,9 +272,9 @@ def _make_boxes(folder: Path) -> None:
 
 
 def _read_boxes(folder: Path) -> None:
-    from nerg_mi.formats.areas import read_regions
+    from nerg_mi.aoi.areas import Areas
 
-    for box in read_regions(folder / "objects.json"):
+    for box in Areas.load(folder / "objects.json").boxes:
         box.contains(box.corners)
 
 

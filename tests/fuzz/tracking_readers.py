@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.rays.readers.registry import list_reader_names
+from nerg_mi.tracking.readers.registry import list_reader_names
 from tests.fuzz.watch import Reader
-from tests.rays.readers.examples import EXAMPLES, TABLE, VARIANTS, Example, write_walk
+from tests.tracking.readers.examples import EXAMPLES, TABLE, VARIANTS, Example, write_walk
 
 
 def _rays():
-    from nerg_mi.rays.rays import Rays
+    from nerg_mi.tracking.rays import Rays
 
     rng = np.random.default_rng(0)
     d = rng.normal(size=(40, 3))
@@ -51,18 +51,18 @@ def _rays():
 def _shown(rays) -> None:
     """Use gaze samples as the commands do: quality report, selection, pseudonyms."""
 
-    from nerg_mi.rays.filters import select_mask
-    from nerg_mi.rays.pseudonyms import pseudonymise
-    from nerg_mi.rays.quality import format_quality_report, summarise
+    from nerg_mi.tracking.filters import select_mask
+    from nerg_mi.tracking.pseudonyms import pseudonymise
+    from nerg_mi.tracking.quality import check_rays
 
-    format_quality_report(rays, summarise(rays), "rays.npz")
+    str(check_rays(rays))
     rays.select(select_mask(rays, time=(0, 1), with_hit=True))
     pseudonymise(rays, bytes(16))
 
 
 def _rays_file(name: str, *kinds: str) -> Reader:
     def read(folder: Path) -> None:
-        from nerg_mi.rays.rays import Rays
+        from nerg_mi.tracking.rays import Rays
 
         _shown(Rays.load(folder / name))
 
@@ -84,7 +84,7 @@ def _read_metadata(folder: Path) -> None:
     from dataclasses import replace
 
     from nerg_mi.files.safe_read import MAX_JSON_BYTES, read_bytes
-    from nerg_mi.rays.rays import read_metadata
+    from nerg_mi.tracking.rays import read_metadata
 
     raw = read_bytes(folder / "metadata.json", "rays file", MAX_JSON_BYTES)
     metadata = read_metadata(raw, folder / "metadata.json")
@@ -100,7 +100,7 @@ def _recording(name: str, example: Example, kind: str = "") -> Reader:
         example.make(folder)
 
     def read(folder: Path) -> None:
-        from nerg_mi.rays.readers.registry import make_options, read_rays
+        from nerg_mi.tracking.readers.registry import make_options, read_rays
 
         options = make_options(name, example.options_in(folder))
         _shown(read_rays(name, example.path_in(folder), options, skip_bad_lines=skip))
@@ -114,7 +114,7 @@ def _tables(name: str, make, *kinds: str) -> Reader:
     """Make a reader of tables for files other than its example."""
 
     def read(folder: Path) -> None:
-        from nerg_mi.rays.readers.registry import make_options, read_rays
+        from nerg_mi.tracking.readers.registry import make_options, read_rays
 
         _shown(read_rays("table", folder / name, make_options("table", EXAMPLES["table"].options)))
 
@@ -125,7 +125,7 @@ def _guess(name: str, make, *kinds: str) -> Reader:
     """Read the proposal for a damaged table without applying it."""
 
     def read(folder: Path) -> None:
-        from nerg_mi.rays.guess import propose_import
+        from nerg_mi.tracking.guess import propose_import
 
         propose_import(folder / name).command  # noqa: B018
 
@@ -143,7 +143,7 @@ def _make_parquet(path: Path) -> None:
 
 def _skeletons(name: str, *kinds: str) -> Reader:
     def read(folder: Path) -> None:
-        from nerg_mi.rays.readers.skeleton import read_skeleton
+        from nerg_mi.tracking.readers.skeleton import read_skeleton
 
         read_skeleton(folder / name)
 
@@ -155,7 +155,7 @@ def _make_salt(folder: Path) -> None:
 
 
 def _read_salt(folder: Path) -> None:
-    from nerg_mi.rays.pseudonyms import read_salt
+    from nerg_mi.tracking.pseudonyms import read_salt
 
     read_salt(folder / "salt")
 
@@ -180,13 +180,13 @@ def _pairs(name: str, kind: str) -> Reader:
 
 
 def _make_alignment(folder: Path) -> None:
-    from nerg_mi.alignment.check import Alignment
+    from nerg_mi.formats.alignments import Alignment
 
     Alignment(np.diag([2.0, 2, 2, 1]), {"kind": "pairs"}, {"count": 5}, None).save(folder / "alignment.json")
 
 
 def _read_alignment(folder: Path) -> None:
-    from nerg_mi.alignment.check import read_similarity
+    from nerg_mi.formats.alignments import read_similarity
 
     read_similarity(folder / "alignment.json", "--align", "rays to field")
 
@@ -216,8 +216,8 @@ _PART = f"a.rays/place=shop/day=unknown/bucket=0/part-{_SOURCE}-0.parquet"
 
 
 def _make_dataset(folder: Path) -> None:
-    from nerg_mi.rays.dataset import DatasetManifest, write_dataset_manifest
-    from nerg_mi.rays.dataset_write import SourceWriter
+    from nerg_mi.tracking.dataset import DatasetManifest, write_dataset_manifest
+    from nerg_mi.tracking.dataset_write import SourceWriter
 
     rays = _rays()
     write_dataset_manifest(folder / "a.rays", DatasetManifest(1))
@@ -227,12 +227,10 @@ def _make_dataset(folder: Path) -> None:
 
 
 def _read_dataset(folder: Path) -> None:
-    from nerg_mi.rays.dataset import Conditions, RayDataset
-    from nerg_mi.rays.quality import format_quality_report
-    from nerg_mi.workflows.rays import make_quality_report
+    from nerg_mi.tracking.dataset import Conditions, RayDataset
+    from nerg_mi.tracking.quality import check_environments
 
-    for title, card in make_quality_report(folder / "a.rays"):
-        format_quality_report(card.rays, card.summary, title, card.lines)
+    list(map(str, check_environments(folder / "a.rays")))
     dataset = RayDataset.open(folder / "a.rays")
     dataset.sample(7, runs=2)
     list(dataset.scan(Conditions(time=(0, 0.3), box=[0, 1, 0, 1, 0, 3], with_hit=True), whole_parts=True))

@@ -14,7 +14,7 @@ from nerg_mi.formats.splats import read_splats
 from nerg_mi.maths.coordinates import check_near_origin
 from nerg_mi.maths.geometry import Box, ContractedBox, Similarity, box_from_dict, intersect_box, intersect_box_numpy
 from nerg_mi.photos.posed import PosedFrame, sort_frames
-from nerg_mi.rays.readers.base import UNITY, RaysBuilder
+from nerg_mi.tracking.readers.base import UNITY, RaysBuilder
 from tests.formats.splats.writers import random_splats, write_antimatter, write_inria, write_khronos
 from tests.reference import march_numpy as reference
 

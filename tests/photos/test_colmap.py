@@ -25,7 +25,7 @@ from nerg_mi.photos.colmap import (
     read_named_poses,
     rotation_to_z,
 )
-from nerg_mi.photos.images import read_posed_images
+from nerg_mi.photos.images import load_photos
 from nerg_mi.photos.transforms import read_transforms
 
 # ---- COLMAP models, written byte by byte and line by line: cameras, poses, points, and invalid files ----
@@ -260,7 +260,7 @@ def test_photos_next_to_a_model_are_used_and_reported(model, folder, has_images)
         child.rename(root / folder / child.name)
     if not has_images:
         images.rmdir()
-    posed = read_posed_images(model)
+    posed = load_photos(model)
     assert len(posed.frames) == 9 and posed.frames[0].image.is_relative_to(root / folder)
     assert posed.root == root / folder and any("photos are in" in note for note in posed.notes)
 
@@ -343,6 +343,30 @@ def test_a_bad_line_of_text_is_numbered(tmp_path, name):
     path.write_text("# one line more\n" + path.read_text().splitlines()[0] + "\n1 SIMPLE x y\n")
     with pytest.raises(ValueError, match=f'line 3 of ".*{name}.txt"'):
         read_colmap(tmp_path, tmp_path)
+
+
+def test_decimal_commas_of_text_are_named(tmp_path):
+    (tmp_path / "a.png").write_bytes(b"")
+    write_txt(tmp_path, ["a.png"])
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 20 10 9,5 9,5 10 5\n")
+    with pytest.raises(NergError, match='"1 PINHOLE 20 10 9,5 9,5 10 5".*with decimal points; export'):
+        read_colmap(tmp_path, tmp_path)
+
+
+@pytest.mark.parametrize(
+    "name, content, said",
+    [
+        ("missing", None, "there is no posed image set"),
+        ("scan.zip", b"PK\x03\x04", "zip archive"),
+        ("scan.mp4", b"\0\0\0\x18ftyp", "is no posed image set.*nerg poses"),
+        ("a.jpg", "", "nerg poses.*ns-process-data"),
+    ],
+)
+def test_what_is_no_posed_image_set_is_named(tmp_path, name, content, said):
+    if content is not None:
+        (tmp_path / name).write_bytes(content or b"")
+    with pytest.raises(NergError, match=said):
+        find_pose_source(tmp_path if content == "" else tmp_path / name)
 
 
 def test_a_folder_without_a_model(tmp_path):

@@ -114,6 +114,13 @@ def test_camera_without_overlap_is_detected():
     assert find_unmatched([*AROUND, outside], box) == [20]
 
 
+@pytest.mark.parametrize("size", [0.5, 0.1])
+def test_cameras_around_a_small_object_see_it(size):
+    """It is between the pixels that are sampled first."""
+    box = Box(*(tuple(np.array([1, 2, 3]) + sign * size / 2) for sign in (-1, 1)))
+    assert find_unmatched(AROUND, box) == []
+
+
 def test_object_without_background_ends_at_box():
     extent = estimate_extent(AROUND, object_only=True)
     assert extent.kind == "object" and not extent.box.is_contracted and extent.box == estimate_box(AROUND, True)[0]
@@ -388,6 +395,24 @@ def test_consistent_depth_passes(depth_views, factor):
 @pytest.mark.parametrize("factor", [1e-3, 1e-2, 0.1, 0.2, 5.0, 100.0, 1e3])
 def test_depth_in_other_units_is_explained(depth_views, factor):
     reason = explain_wrong_depth([(c, factor * d) for c, d in depth_views])
+    assert reason is not None and f"multiplication by {1 / factor:g}, " in reason
+
+
+@pytest.mark.parametrize("factor", [1e-3, 0.1])
+def test_depth_of_an_object_in_other_units_is_explained(factor):
+    """In units that are too large, few points of it are before other cameras, and these agree by chance."""
+    views = []
+    for k in (*range(1, 8), *range(9, 12)):
+        a = 2 * np.pi * k / 12
+        pose = make_camera_looking_at(np.array([3 * np.cos(a), 3 * np.sin(a), 0.8 + 0.1 * (k % 3)]), [0, 0, 0]).to_world
+        camera = PosedCamera(Intrinsics(32, 24, 30.0, 31.0, 15.5, 12.25), pose)
+        d = pixel_directions(camera.intrinsics) @ pose[:3, :3].T
+        with np.errstate(divide="ignore"):
+            ends = np.sort([(side - camera.center) / d for side in (-0.5, 0.5)], axis=0)
+        near, far = ends[0].max(axis=-1), ends[1].min(axis=-1)
+        views.append((camera, np.where(near < far, near, 0)))
+    assert explain_wrong_depth(views) is None
+    reason = explain_wrong_depth([(c, factor * d) for c, d in views])
     assert reason is not None and f"multiplication by {1 / factor:g}, " in reason
 
 

@@ -15,9 +15,11 @@ from nerg_mi.photos.dataset import open_dataset
 from nerg_mi.photos.images import (
     PhotoView,
     apply_lens,
+    load_photos,
     load_usable_views,
     load_view,
     make_pinhole_camera,
+    open_photos,
     read_depth,
     read_image,
     read_mask,
@@ -29,6 +31,7 @@ from nerg_mi.photos.images import (
 from nerg_mi.photos.posed import DepthFile, MaskFile, PosedFrame
 from nerg_mi.photos.transforms import read_transforms
 from tests.photos.written_sets import (
+    COUNT,
     METRES_ALONG_RAYS,
     OPENCV,
     H,
@@ -98,12 +101,12 @@ def test_downscaling_averages_areas(dataset, width, height):
     assert view.camera.intrinsics.fx == pytest.approx(10 * width / 12)
 
 
-def test_downscale_and_width_errors(dataset):
+def test_invalid_widths_are_refused(dataset):
     frames = read_transforms(dataset[0] / "transforms.json").frames
-    assert load_view(frames[0], downscale=4).color.shape == (2, 3, 4)
-    for arguments in ({"width": 13}, {"downscale": 0.5}, {"width": 3, "downscale": 2}, {"width": 0}):
-        with pytest.raises(ValueError):
-            load_view(frames[0], **arguments)
+    assert load_view(frames[0], width=3).color.shape == (2, 3, 4)
+    for width in (13, 0):
+        with pytest.raises(NergError):
+            load_view(frames[0], width)
 
 
 def test_invalid_depth_error_names_file(dataset):
@@ -111,6 +114,21 @@ def test_invalid_depth_error_names_file(dataset):
     np.save(folder / "00.npy", np.zeros((3, 3), np.float32))
     views, unused = load_usable_views(read_transforms(folder / "transforms.json").frames, depth=True)
     assert len(views) == 9 and unused[0].name == "00.png" and "00.npy" in unused[0].reason
+
+
+def test_photos_are_objects(ring):
+    loaded = load_photos(ring)
+    assert open_photos(loaded) is loaded and len(loaded) == COUNT
+    frame = loaded.to_dataframe("pandas")
+    assert frame["photo"].tolist() == [f.name for f in loaded.frames]
+    poses = np.stack([f.to_world for f in loaded.frames])
+    np.testing.assert_array_equal(frame[["x", "y", "z"]], poses[:, :3, 3])
+    np.testing.assert_array_equal(frame[["dx", "dy", "dz"]], -poses[:, :3, 2])
+    # Photos in memory and their folder are the same data set, with the same held-out views.
+    ours, files = read_split(loaded), read_split(ring)
+    assert [f.name for f in ours.held_out] == [f.name for f in files.held_out] and ours.rule == files.rule
+    moved = read_split(loaded.transform(np.diag([2.0, 2, 2, 1])))
+    np.testing.assert_allclose(moved.posed.centers, 2 * files.posed.centers)
 
 
 def test_every_kth_of_the_sorted_frames_is_held_out(dataset):
@@ -204,6 +222,15 @@ def test_depth_channel_of_exr_is_selected_by_name(tmp_path, names):
     write_exr(tmp_path / "b.exr", {n: rng.random((2, 3)).astype(np.float32) for n in "RGB"})
     with pytest.raises(NergError, match="b.exr"):
         read_depth(DepthFile(tmp_path / "b.exr"))
+
+
+def test_negative_depth_is_refused(tmp_path):
+    path = tmp_path / "d.npy"
+    np.save(path, -np.arange(6.0).reshape(2, 3))
+    with pytest.raises(NergError, match="d.npy.*negative.*negate"):
+        read_depth(DepthFile(path, 1.0))
+    np.save(path, np.full((2, 3), -1.0))
+    assert not read_depth(DepthFile(path, 1.0)).any()  # a value for unknown depth
 
 
 def test_unreadable_depth_error_names_file(tmp_path, rgb):

@@ -4,8 +4,8 @@ import drjit.llvm.ad as ns
 import numpy as np
 
 from nerg_mi.fields.encoding import HashGridConfig
-from nerg_mi.fields.gaze_product import GazeConfig, GazeField
-from nerg_mi.fields.radiance import RadianceConfig, RadianceField
+from nerg_mi.fields.gaze_product import GazeConfig, ProductHead
+from nerg_mi.fields.radiance import RadianceConfig, RadianceNetwork
 from nerg_mi.formats.fields import save_gaze, save_radiance
 from nerg_mi.maths.geometry import Box
 
@@ -14,7 +14,7 @@ BOX = Box((-1, -1, -1), (1, 1, 1))
 
 
 def radiance(path, density_scale=2.0, seed=0, occupancy=None, geometry=7, deferred=False, **kwargs):
-    field = RadianceField.random(
+    field = RadianceNetwork.random(
         RadianceConfig(GRID, 16, geometry=geometry, sh_degree=2, density_scale=density_scale, deferred=deferred),
         BOX,
         ns,
@@ -30,7 +30,7 @@ def radiance(path, density_scale=2.0, seed=0, occupancy=None, geometry=7, deferr
 
 
 def gaze(path, variant="emit_capture", seed=1, **kwargs):
-    field = GazeField.random(GazeConfig(GRID, variant, width=16, geometry=7, sh_degree=2, **kwargs), BOX, ns, seed)
+    field = ProductHead.random(GazeConfig(GRID, variant, width=16, geometry=7, sh_degree=2, **kwargs), BOX, ns, seed)
     table = 2 * np.random.default_rng(seed).normal(size=len(field.grid.table)).astype(np.float32)
     field.set_parameters({"grid.table": ns.Float(table)})
     save_gaze(field, path, {"test": seed})

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.maths.vmf import log_normaliser
-from nerg_mi.rays.rays import Rays
+from nerg_mi.tracking.rays import Rays
 from tests.reference import kde as reference
 
 from .scenes import camera, channels, make_observer, named, picture, plugin, points, put, room, scene_with, stored, wall

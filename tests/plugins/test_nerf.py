@@ -8,7 +8,7 @@ from scipy.ndimage import binary_erosion
 
 from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.occupancy import OccupancyGrid
-from nerg_mi.fields.radiance import Background, BackgroundConfig, RadianceConfig, RadianceField
+from nerg_mi.fields.radiance import Background, BackgroundConfig, RadianceConfig, RadianceNetwork
 from nerg_mi.formats.fields import load_radiance, save_radiance
 from nerg_mi.maths.color import decode_srgb, encode_srgb
 from nerg_mi.maths.geometry import Box, ContractedBox
@@ -182,7 +182,7 @@ def endless(tmp_path):
     grid = HashGridConfig(levels=2, log2_rows=8, base=4, finest=16)
     config = RadianceConfig(grid, width=16, geometry=3, sh_degree=2, density_scale=0.25)
     box = ContractedBox(Box((-2, -2, -2), (2, 2, 2)), 16)
-    made = RadianceField.random(config, box, ns, march_step=0.02, march_growth=1 / 128)
+    made = RadianceNetwork.random(config, box, ns, march_step=0.02, march_growth=1 / 128)
     made.set_parameters({k: dr.zeros(type(v), v.shape) for k, v in made.parameters().items() if "density" in k})
     save_radiance(made, tmp_path / "f.safetensors", {})
     return stored("nerf", tmp_path / "f.safetensors")

@@ -8,16 +8,16 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from nerg_mi.api.scene import Scene
+from nerg_mi.environment.scene import Scene
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation.study import count_traced_operations
+from nerg_mi.figures.image_files import draw_difference, draw_sheet
+from nerg_mi.figures.layers import render_layers
 from nerg_mi.figures.overlay import find_overlay, to_bytes
 from nerg_mi.figures.style import figure_of
 from nerg_mi.files.images import write_exr
 from nerg_mi.transport import aovs
 from nerg_mi.viewer.layers import choose_range, choose_scale, colorize, format_legend, list_layers
-from nerg_mi.workflows.draw import draw
-from nerg_mi.workflows.render import render_layers
 
 from . import fields
 from .scenes import (
@@ -149,13 +149,13 @@ def test05_new_aov_is_displayed_everywhere(rgb, table, tmp_path, kind):
     # Files: sheets and differences.
     file = tmp_path / "a.exr"
     write_exr(file, {"rows.Y": layers.values, "opacity.Y": layers.mask.astype(np.float32)})
-    said = [axes.get_ylabel().replace("\n", " ") for axes in draw("sheet", [file], overlay="rows").axes]
+    said = [axes.get_ylabel().replace("\n", " ") for axes in draw_sheet(file, overlay="rows").axes]
     assert "row of the shelf [rows]" in said
     if kind == "categorical":
         with pytest.raises(NergError, match='"rows" is categorical'):
-            draw("difference", [file, file], channel="rows")
+            draw_difference(file, file, channel="rows")
     else:
-        said = [axes.get_ylabel() for axes in draw("difference", [file, file], channel="rows").axes]
+        said = [axes.get_ylabel() for axes in draw_difference(file, file, channel="rows").axes]
         assert any("difference of rows [rows]" in text.replace("\n", " ") for text in said)
 
 

@@ -339,7 +339,8 @@ def test04_ray_batch_matches_its_pixels(rgb, files):
 @pytest.mark.parametrize(
     "kind, light",
     [
-        *((kind, "nested") for kind in ("grid", "field", "gaze", "refined")),
+        *((kind, "nested") for kind in ("grid", "gaze")),
+        *(pytest.param(kind, "nested", marks=pytest.mark.nightly) for kind in ("field", "refined")),
         *(("grid", light) for light in ("direct", "emitters", "headlight")),
     ],
 )

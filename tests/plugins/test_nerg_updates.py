@@ -6,8 +6,8 @@ import pytest
 
 from nerg_mi.fields.gaze_base import GazeEnsemble, RaySupport
 from nerg_mi.formats.fields import save_gaze
-from nerg_mi.rays.rays import Rays
 from nerg_mi.registration import get_plugin_class
+from nerg_mi.tracking.rays import Rays
 from nerg_mi.transport import observer, volume_medium
 from nerg_mi.transport.mitsuba_mesh import positions_key
 from tests.formats.splats.writers import random_splats

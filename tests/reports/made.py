@@ -7,8 +7,7 @@ import json
 import numpy as np
 
 from nerg_mi.evaluation.gaze_report import GazeResults
-from nerg_mi.formats.areas import Region
-from nerg_mi.rays.quality import summarise
+from nerg_mi.formats.boxes import Region
 from nerg_mi.reports.data import (
     MeanShare,
     ObjectAttention,
@@ -19,6 +18,7 @@ from nerg_mi.reports.data import (
     Stage,
     pack_stage,
 )
+from nerg_mi.tracking.quality import summarise
 from tests.evaluation.test_gaze import crowd
 from tests.evaluation.test_gaze_report import scored
 

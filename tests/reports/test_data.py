@@ -10,21 +10,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nerg_mi.api.scene import make_scene
+from nerg_mi.aoi.placed import BoxAoi as Solid
+from nerg_mi.aoi.placed import HitAssignment
+from nerg_mi.aoi.shares import Shares
 from nerg_mi.environment.environment import Environment
+from nerg_mi.environment.scene import make_scene
 from nerg_mi.evaluation.gaze_report import GazeResults, small_sample_factor
 from nerg_mi.fields.encoding import HashGridConfig
-from nerg_mi.fields.gaze_product import GazeConfig, GazeField
+from nerg_mi.fields.gaze_product import GazeConfig, ProductHead
 from nerg_mi.fields.mlp import namespace
-from nerg_mi.formats.areas import Region
+from nerg_mi.formats.boxes import Region
 from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.measures.shares import Shares
-from nerg_mi.measures.visits import BoxAoi as Solid
-from nerg_mi.measures.visits import HitAssignment
-from nerg_mi.rays.rays import Rays
 from nerg_mi.reports.data import (
-    GazeSampler,
     ParticipantLabels,
     anonymize_rays,
     anonymize_results,
@@ -33,12 +31,14 @@ from nerg_mi.reports.data import (
     estimate_normals,
     farthest_point_sampling,
     make_proxy,
+    make_report_sampler,
     mean_over_participants,
     normals_from_image,
     pack_stage,
     sample_eye_positions,
     summarize_objects,
 )
+from nerg_mi.tracking.rays import Rays
 from nerg_mi.transport.geometry import SceneGeometry
 from tests.evaluation.test_gaze import crowd
 from tests.reports.made import full_run, minimal_run, stage
@@ -55,9 +55,9 @@ def hall(rgb):
     scene = rgb.load_dict({"type": "scene", "box": {"type": "cube", "to_world": to_world, "flip_normals": True}})
     box = Box(tuple(LOW), tuple(HIGH))
     config = GazeConfig(grid=HashGridConfig(levels=4, log2_rows=10, base=4, finest=16), width=16, normalized=True)
-    field = GazeField.random(config, box, namespace(rgb.variant()), 3)
+    field = ProductHead.random(config, box, namespace(rgb.variant()), 3)
     place = Environment(SceneGeometry(None, scene), box, "scene")
-    return GazeSampler(field, place), place
+    return make_report_sampler(field, place), place
 
 
 def aois(boxes):
@@ -156,8 +156,8 @@ def test_rays_in_another_frame(hall, rgb):
 def test_rays_meet_nothing_without_geometry(rgb):
     box = Box((-2.0,) * 3, (2.0,) * 3)
     grid = HashGridConfig(levels=2, log2_rows=8, base=4, finest=8)
-    field = GazeField.random(GazeConfig(grid=grid, width=16), box, namespace(rgb.variant()), 1)
-    onlooker = GazeSampler(field, Environment(None, box, "none"))
+    field = ProductHead.random(GazeConfig(grid=grid, width=16), box, namespace(rgb.variant()), 1)
+    onlooker = make_report_sampler(field, Environment(None, box, "none"))
     depth, is_hit = onlooker.trace(np.zeros((3, 3)), np.eye(3))
     assert not is_hit.any() and not depth.any()
 

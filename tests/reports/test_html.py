@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from nerg_mi.files import html
-from nerg_mi.rays.rays import TRACKING
 from nerg_mi.reports.charts import Point, interval_chart, nice_ticks
 from nerg_mi.reports.sections import SECTIONS, SETTINGS, render_page
+from nerg_mi.tracking.rays import TRACKING
 from tests.reports.made import HOSTILE, PNG, full_run, minimal_run, packed_scene
 
 # ---- Charts ----
@@ -207,6 +207,20 @@ def test_section_texts():
     assert "ab" * 32 in said["provenance"]
 
 
+@pytest.mark.parametrize(
+    "choice, expected",
+    [
+        ({"validation_views": ["a"]}, "22.0 dB PSNR on 2 held-out photos"),
+        ({"psnr_watched": {"views": ["a"], "result": {}}}, "22.0 dB PSNR on 2 held-out photos"),
+        ({"psnr_watched": {"views": ["a"]}}, "25.0 dB PSNR on 3 held-out photos"),
+    ],
+)
+def test_photos_that_chose_the_state_of_a_field_do_not_score_it(choice, expected):
+    """Also in checkpoints of earlier versions, whose stored mean includes them."""
+    provenance = {"psnr_held_out": {"mean": 25.0, "views": {"a": 31.0, "b": 21.0, "c": 23.0, "d": None}}, **choice}
+    assert expected in render_page(replace(minimal_run(), radiance={"provenance": provenance}))
+
+
 def test_held_out_participants_are_not_named():
     assert "Ada" not in text_of(SETTINGS, replace(full_run(), gaze={"provenance": {"test": {"people": ["Ada"]}}}))
 
@@ -237,4 +251,6 @@ def test_each_split_has_a_verdict():
     verdict, scores = (next(s for s in SECTIONS if s.name == n) for n in ("verdict", "scores"))
     assert re.search("No verdict for .*: 3 participants", text_of(verdict, run))
     assert "(3 participants, 60 positions)" in text_of(scores, run)
+    seen = text_of(verdict, replace(run, results=(replace(both, split="pos"),)))
+    assert "Evaluated on training participants at held-out positions (" in seen
     assert HOSTILE not in scores.render(replace(run, results=(replace(both, split=HOSTILE),)))

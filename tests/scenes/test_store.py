@@ -12,7 +12,7 @@ mi = pytest.importorskip("mitsuba")
 
 from nerg_mi.scenes.store import attention_law, cameras, layout, make, shoppers, twin, views  # noqa: E402
 
-from nerg_mi.rays.rays import Rays  # noqa: E402
+from nerg_mi.tracking.rays import Rays  # noqa: E402
 from tests.plugins import scenes  # noqa: E402
 from tests.plugins.scenes import still  # noqa: E402
 from tests.plugins.test_nerg_gradients import COLOR, DEPTH, LAST, check  # noqa: E402
@@ -213,7 +213,7 @@ def test_law_names_an_unknown_category():
 
 
 def test_shoppers_keep_clear_of_furniture_and_return_to_the_skeleton_file(store, law, tmp_path):
-    from nerg_mi.rays.readers.skeleton import LEFT_EAR, NOSE, RIGHT_EAR, head_poses, read_skeleton
+    from nerg_mi.tracking.readers.skeleton import LEFT_EAR, NOSE, RIGHT_EAR, head_poses, read_skeleton
 
     ids, times, origins, directions = shoppers.simulate_shoppers(store, shoppers=3, stops=(2, 4), seed=5, law=law)
     again = shoppers.simulate_shoppers(store, shoppers=3, stops=(2, 4), seed=5, law=law)

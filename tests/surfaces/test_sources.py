@@ -10,7 +10,6 @@ from scipy.stats import norm
 
 from nerg_mi.errors import NergError
 from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.rays.rays import Rays
 from nerg_mi.surfaces.laplacian import merge_sums
 from nerg_mi.surfaces.mesh import SurfaceTarget, refine
 from nerg_mi.surfaces.sources import (
@@ -29,6 +28,7 @@ from nerg_mi.surfaces.sources import (
     sum_gaze,
     sum_rays,
 )
+from nerg_mi.tracking.rays import Rays
 from tests.surfaces.meshes import box, joined, observers_from_law, plate, vmf
 
 # ---- Cones, against Legendre polynomials and the Rayleigh distribution ----

@@ -54,7 +54,7 @@ class ClusterOfProcesses:
         """Start another worker with `nerg worker`; it may not be connected yet when this returns."""
         code = "from nerg_mi.cli import main; main()"
         number = len(self.workers)
-        line = ("-c", code, "worker", self.address, "--threads", "1", "--name", f"w{number}")
+        line = ("-c", code, "worker", self.address, "--threads", "1")
         self.workers.append(self._start(f"worker{number}", *line))
         return self.workers[-1]
 

@@ -19,12 +19,27 @@ from nerg_mi.tasks.cluster import (
     find_local_host,
     import_distributed,
     make_security,
-    run_dask_worker,
+    run_worker,
 )
 from nerg_mi.tasks.engines import run_plan
 from nerg_mi.tasks.store import Store
+from tests.recorder import Recorder
 from tests.tasks import works
-from tests.tasks.clusters import ClusterOfProcesses, free_port, wait_until
+from tests.tasks.clusters import DEADLINE, ClusterOfProcesses, free_port, wait_until
+
+
+@pytest.fixture(autouse=True)
+def _deadline():
+    """Fail a test that waits without end, as for a scheduler that is none."""
+
+    def fail(*arguments):
+        raise TimeoutError(f"the test takes more than {DEADLINE:g} s")
+
+    before = signal.signal(signal.SIGALRM, fail)
+    signal.alarm(int(DEADLINE))
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
 
 
 @pytest.fixture
@@ -166,10 +181,10 @@ def test_another_program_is_no_scheduler(tmp_path, monkeypatch, banner):
             )
         if not banner:
             assert any("for at most 1 s" in w for w in warnings)
-        messages = []
+        recorder = Recorder()
         with pytest.raises(NergError, match=f"no scheduler answered at {address}"):
-            run_dask_worker(address, 1.0, messages.append)
-        assert any("for at most 1 s" in m for m in messages)
+            run_worker(address, wait=1.0, progress=recorder)
+        assert any("for at most 1 s" in m for m in recorder.messages)
         for connection in connections:
             connection.close()
 
@@ -223,7 +238,7 @@ def test_missing_scheduler_is_reported(tmp_path):
     with pytest.raises(NergError, match=f"no scheduler answers at {address}"):
         read_outputs(works.make_plan(1), Store(tmp_path / "s"), ClusterEngine(address, timeout=0.5))
     with pytest.raises(NergError, match=f"no scheduler answered at {address} within 1 s"):
-        run_dask_worker(address, 1.0, print)
+        run_worker(address, wait=1.0)
 
 
 def test_files_are_localized(tmp_path):

@@ -17,7 +17,7 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.tasks import task as module
 from nerg_mi.tasks.engines import LocalEngine, run_plan
-from nerg_mi.tasks.store import Store, list_files, read_contents, read_plan, read_status, remove_stale
+from nerg_mi.tasks.store import Store, delete_stale, list_files, read_contents, read_plan, read_status
 from nerg_mi.tasks.task import (
     RENDER_LIBRARIES,
     Checksums,
@@ -417,7 +417,7 @@ def test_outputs_without_job_are_stale(store):
     )
     account = read_status(store)
     assert sorted(r.label for r in account.stale) == ["part 2", "part 3"]
-    assert account.stale_bytes == 130 == remove_stale(store, account)
+    assert account.stale_bytes == 130 == delete_stale(store, account)
     left = read_status(store)
     assert left.stale == () and [job.done for job in left.jobs] == [2, 1] and left.bytes == 130
 
@@ -436,7 +436,7 @@ def test_outputs_of_changed_files_are_stale(store, tmp_path):
     assert both.changed == (str(tmp_path / "a"),) and both.outdated == 2
     assert each.changed == (str(tmp_path / "b"),) and each.missing == (str(tmp_path / "c"),) and each.outdated == 1
     assert {r.label for r in account.stale} == {"part 0", "part 1", "of b"}
-    remove_stale(store, account)
+    delete_stale(store, account)
     assert [r.label for r in store.iter_manifests()] == ["of c"]
 
 
@@ -462,7 +462,7 @@ def test_old_leftovers_are_removed(store):
     for path in (hidden, folder, store.output_path(unsigned, ".txt")):
         os.utime(path, (1, 1))
     account = read_status(store)
-    assert len(account.leftovers) == 3 and account.leftover_bytes == 9 + 65 == remove_stale(store, account)
+    assert len(account.leftovers) == 3 and account.leftover_bytes == 9 + 65 == delete_stale(store, account)
     assert not hidden.exists() and not folder.exists() and read_status(store).jobs[0].done == 1
 
 

@@ -14,12 +14,13 @@ from typing import Any
 
 from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import write_text
-from nerg_mi.options import PartOptions, option
+from nerg_mi.options import option
+from nerg_mi.ranges import ValidatedDataclass
 from nerg_mi.tasks.task import FOLDER_SUFFIX, Checksums, Part, Plan, find_inputs, relocate_paths
 
 
 @dataclass(frozen=True, kw_only=True)
-class Settings(PartOptions):
+class Settings(ValidatedDataclass):
     """Settings of `write_hash`: its input files, and how it runs."""
 
     files: tuple[Path, ...] = ()

@@ -56,7 +56,12 @@ class Killed(BaseException):
 
 
 @pytest.mark.parametrize(
-    "held_out, depth, kills", [(True, False, (1, 16, 33)), (True, True, (9, 47)), (False, False, (20, 41, 44))]
+    "held_out, depth, kills",
+    [
+        (True, False, (1, 16, 33)),
+        pytest.param(True, True, (9, 47), marks=pytest.mark.nightly),
+        pytest.param(False, False, (20, 41, 44), marks=pytest.mark.nightly),
+    ],
 )
 def test_killed_runs_have_the_result_of_an_uninterrupted_one(
     dataset, one_thread, tmp_path, monkeypatch, held_out, depth, kills

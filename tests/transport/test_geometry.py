@@ -11,7 +11,7 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.mlp import namespace
-from nerg_mi.fields.radiance import RadianceConfig, RadianceField
+from nerg_mi.fields.radiance import RadianceConfig, RadianceNetwork
 from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.transport.field_medium import FieldMedium
 from nerg_mi.transport.geometry import (
@@ -374,7 +374,7 @@ def test_batches_and_array_types_agree(slab, rgb, batch):
 def test_scaled_field_has_scaled_depth(rgb):
     ns = namespace("llvm")
     config = RadianceConfig(grid=HashGridConfig(levels=2, log2_rows=8, base=4, finest=8), width=16, density_scale=20.0)
-    field = RadianceField.random(config, Box((-1, -1, -1), (1, 1, 1)), ns, 1, march_step=1 / 64)
+    field = RadianceNetwork.random(config, Box((-1, -1, -1), (1, 1, 1)), ns, 1, march_step=1 / 64)
     scaled = FieldMedium(field, Similarity(np.diag([10.0, 10, 10, 1])))
     near, a = trace_depth(FieldMedium(field), O[:1], D[:1])
     far, b = trace_depth(scaled, 10 * O[:1], D[:1])

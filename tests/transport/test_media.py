@@ -12,7 +12,7 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.occupancy import OccupancyGrid, cascades_from_contracted
-from nerg_mi.fields.radiance import RadianceConfig, RadianceField, mean_features
+from nerg_mi.fields.radiance import RadianceConfig, RadianceNetwork, mean_features
 from nerg_mi.maths.geometry import Box, ContractedBox, Similarity
 from nerg_mi.transport.field_medium import FeatureShader, FieldMedium, features_for_observer, make_color_shader
 from nerg_mi.transport.geometry import SceneGeometry
@@ -133,7 +133,7 @@ BOX = Box((0, 0, 0), (1, 1, 2))
 
 
 def field(**kwargs):
-    f = RadianceField.random(
+    f = RadianceNetwork.random(
         RadianceConfig(GRID, width=16, geometry=3, sh_degree=2), BOX, ns, march_step=0.05, **kwargs
     )
     f.set_parameters(
@@ -221,7 +221,7 @@ def plain_field(**kwargs):
     """A field whose density net returns 0: σ = SCALE / m², m the maximum norm in half edges (2 units) from (1, 0, 0),
     at least 1."""
     config = RadianceConfig(GRID, width=16, geometry=3, sh_degree=2, density_scale=SCALE)
-    field = RadianceField.random(config, ENDLESS, ns, march_step=0.02, march_growth=GROWTH, **kwargs)
+    field = RadianceNetwork.random(config, ENDLESS, ns, march_step=0.02, march_growth=GROWTH, **kwargs)
     field.set_parameters({k: dr.zeros(type(v), v.shape) for k, v in field.parameters().items() if "density" in k})
     return field
 
@@ -292,7 +292,7 @@ def test_contracted_empty_cells_are_skipped(rgb):
 
 def test_bounded_field_has_uniform_steps(rgb):
     config = RadianceConfig(GRID, width=16, geometry=3, sh_degree=2)
-    assert FieldMedium(RadianceField.random(config, ENDLESS.core, ns, march_step=0.02)).default_dt_gamma == 0
+    assert FieldMedium(RadianceNetwork.random(config, ENDLESS.core, ns, march_step=0.02)).default_dt_gamma == 0
 
 
 # ---- Mitsuba volumes as media: errors, skipped cells, and changes of their data ----
@@ -418,7 +418,7 @@ O, D = np.array([0.1, -0.2, -3.0]), np.array([0.0, 0.1, 1.0]) / np.hypot(0.1, 1)
 def place(rgb):
     """A field of the cube [-1, 1]³, at twice the size."""
     config = RadianceConfig(HashGridConfig(levels=2, log2_rows=10, base=4, finest=8), width=16, geometry=3, sh_degree=2)
-    field, rng = RadianceField.random(config, Box((-1, -1, -1), (1, 1, 1)), ns, 0), np.random.default_rng(0)
+    field, rng = RadianceNetwork.random(config, Box((-1, -1, -1), (1, 1, 1)), ns, 0), np.random.default_rng(0)
     field.set_parameters({"grid.table": ns.Float(rng.normal(size=len(field.grid.table)).astype(np.float32))})
     return SceneGeometry(FieldMedium(field, Similarity(np.diag([2.0, 2, 2, 1])))), field
 
@@ -467,7 +467,7 @@ def test_deferred_color_uses_composited_features(rgb, place):
     for deferred in (False, True):
         field = place[1]
         config = replace(field.config, deferred=deferred)
-        medium = FieldMedium(RadianceField(config, field.box, field.grid, field.density_net, field.color_net))
+        medium = FieldMedium(RadianceNetwork(config, field.box, field.grid, field.density_net, field.color_net))
         ray = medium.ray_to_local(rgb.Point3f(0.1, -0.2, -3), rgb.Vector3f(*map(float, D)))
         one, both = make_color_shader(medium, rgb.Color3f), make_color_shader(medium, rgb.Color3f, with_features=True)
         kinds.append(type(one))

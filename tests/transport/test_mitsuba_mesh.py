@@ -160,6 +160,13 @@ def test_face_colors(rgb, version):
     assert np.allclose(read_attribute(mesh, "face_color"), COLORS[:2])
 
 
+def test_opacities_of_colors_are_left_out(rgb, version):
+    mesh = make_mesh(QUAD, FACES, "quad")
+    for name, colors in (("vertex_color", COLORS), ("face_color", COLORS[:2])):
+        add_attribute(mesh, name, np.column_stack([colors, np.full(len(colors), 0.5)]))
+        assert np.allclose(read_attribute(mesh, name), colors)
+
+
 def test_rectangles_have_triangles_and_follow_their_transform(rgb):
     """Their parameters do not include their vertices."""
     placed = rgb.ScalarTransform4f().translate([1, 2, 3]).scale([2, 1, 1])

@@ -14,7 +14,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.fields import gaze_hits
 from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.gaze_log_density import LogGazeField
-from nerg_mi.fields.gaze_product import GazeConfig, GazeField
+from nerg_mi.fields.gaze_product import GazeConfig, ProductHead
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.formats.surfaces import write_volume
 from nerg_mi.maths.geometry import Box, Similarity
@@ -236,7 +236,7 @@ def test_attached_integrals_are_not_cached(rgb):
 
 def test_gaze_rotates_and_is_scale_invariant(rgb):
     ns, grid = namespace("llvm_ad_rgb"), HashGridConfig(levels=2, log2_rows=10, base=4, finest=16)
-    g = GazeField.random(GazeConfig(grid, width=16), Box((0, 0, 0), (1, 1, 2)), ns)
+    g = ProductHead.random(GazeConfig(grid, width=16), Box((0, 0, 0), (1, 1, 2)), ns)
     table = np.random.default_rng(0).normal(size=len(g.grid.table)).astype(np.float32)
     g.set_parameters({"grid.table": ns.Float(table)})
     p_o, p_od = np.array([0.2, 0.3, 0.1]), np.array([0.7, 0.6, 1.5])

@@ -6,17 +6,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from nerg_mi.scenes.store import SCENE_FILE
 
 import nerg_mi as nerg
+from nerg_mi.cli import demo
 from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.formats.fields import save_gaze
 from nerg_mi.maths.geometry import Box
-from nerg_mi.viewer.session import Session
-from nerg_mi.workflows import demo
-from nerg_mi.workflows.scene_commands import ViewOptions
-from nerg_mi.workflows.view import make_viewer_scene
+from nerg_mi.viewer.session import Session, SessionSettings
+from nerg_mi.viewer.source import open_viewer_scene
 
 # ---- A simple room with an analytic solution ----
 
@@ -89,7 +89,7 @@ def gaze_fields(rgb, tmp_path):
 @pytest.fixture
 def store(rgb):
     """File of the demo store's scene with its trained fields."""
-    path = demo.find_store_scene()
+    path = SCENE_FILE
     if not all((path.parent / name).is_file() for name in demo.CHECKPOINTS.values()):
         pytest.skip("the store's fields are not here: python -m nerg_mi.scenes.store.make")
     return path
@@ -121,10 +121,9 @@ def make_session(tmp_path):
     made = []
 
     def make(path, *other_files, **options) -> Session:
-        selected = ViewOptions(**{"compile": False, **options})
-        session = Session(
-            lambda: make_viewer_scene([path, *other_files], tmp_path, selected), selected, CountingListener()
-        )
+        settings = SessionSettings(**{"compile": False, **options})
+        load = lambda: open_viewer_scene([path, *other_files], tmp_path, observer=settings.observer)
+        session = Session(load, settings, CountingListener())
         made.append(session)
         session.start()
         return session

@@ -12,9 +12,10 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.fields.encoding import HashGridConfig
-from nerg_mi.fields.radiance import RadianceConfig, RadianceField
+from nerg_mi.fields.radiance import RadianceConfig, RadianceNetwork
 from nerg_mi.formats.fields import save_radiance
 from nerg_mi.maths.geometry import Box
+from nerg_mi.viewer import compilation
 from nerg_mi.viewer.compilation import BackgroundCompilation, find_compiled_file, is_current
 from nerg_mi.viewer.page import BrowserWindow, Page
 from nerg_mi.viewer.points import FRAME_SECONDS, FramePace, PinholeView
@@ -24,7 +25,7 @@ VIEW = PinholeView.look_at((0, 0, 0), (1, 0, 0), (0, 0, 1), 0.8, 1.6)
 
 def write_field(path, seed=0):
     config = RadianceConfig(grid=HashGridConfig(levels=2, log2_rows=10, base=4, finest=16))
-    field = RadianceField.random(config, Box((-1, -1, -1), (1, 1, 1)), ns, seed)
+    field = RadianceNetwork.random(config, Box((-1, -1, -1), (1, 1, 1)), ns, seed)
     save_radiance(field, path, {})
     return path
 
@@ -40,7 +41,11 @@ def wait_until(condition, seconds=120):
 
 
 @pytest.mark.slow
-def test_a_copy_is_made_in_the_background_and_kept(rgb, make_session, tmp_path):
+def test_a_copy_is_made_in_the_background_and_kept(rgb, make_session, tmp_path, monkeypatch):
+    # At a coarse resolution, since the default doubles it as long as a field of noise needs.
+    program = compilation._PROGRAM.replace("(sys.argv[1])", "(sys.argv[1], resolution=32)")
+    assert program != compilation._PROGRAM
+    monkeypatch.setattr(compilation, "_PROGRAM", program)
     (tmp_path / "fields").mkdir()
     field = write_field(tmp_path / "fields" / "room.safetensors")
     session = make_session(field, compile=True)
@@ -80,8 +85,8 @@ def test_a_failure_is_reported_and_a_stop_is_silent(rgb, tmp_path):
     BackgroundCompilation(missing, tmp_path / "a.safetensors", called.append, report)
     assert event.wait(60) and called == [] and isinstance(errors[0], NergError) and "missing" in str(errors[0])
     field = write_field(tmp_path / "room.safetensors")
-    compilation = BackgroundCompilation(field, tmp_path / "b.safetensors", called.append, errors.append)
-    compilation.stop()
+    running = BackgroundCompilation(field, tmp_path / "b.safetensors", called.append, errors.append)
+    running.stop()
     assert called == [] and len(errors) == 1 and os.listdir(tmp_path) == ["room.safetensors"]
 
 

@@ -9,17 +9,18 @@ import numpy as np
 import pytest
 
 import nerg_mi as nerg
+from nerg_mi.environment.nested_scene import replace_gaze
 from nerg_mi.errors import NergError
 from nerg_mi.figures.overlay import Heat, overlay, to_bytes
 from nerg_mi.figures.style import LINE, hatch_lines
-from nerg_mi.formats.areas import Region
-from nerg_mi.rendering.nested_scene import replace_gaze
+from nerg_mi.formats.boxes import Region
 from nerg_mi.viewer import layers
 from nerg_mi.viewer.controls import Inset, box_edges, encode_picture, fit_box, format_shares, slider_max
 from nerg_mi.viewer.layers import STALE_STYLE, DisplaySettings, Scale, get_layer
 from nerg_mi.viewer.points import PinholeView
 from nerg_mi.viewer.scene import copy_view
-from nerg_mi.viewer.session import AttentionShare, Worker
+from nerg_mi.viewer.shares import AttentionShare
+from nerg_mi.viewer.worker import Worker
 
 # ---- Boxes fitted to a rectangle ----
 
@@ -98,14 +99,14 @@ def test06_slider_range_contains_value(value, end):
 
 def test07_copied_view_is_a_scene(store, tmp_path):
     place = SimpleNamespace(made=False)
-    options = SimpleNamespace(width=48)
+    settings = SimpleNamespace(width=48)
     view = PinholeView.look_at((7, 3, 2), (5, 4, 1), (0, 0, 1), 0.9, 1.5)
     shown = SimpleNamespace(
         source=place,
         scene_file=store,
         display=DisplaySettings(get_layer("gaze")),
         observer=np.array([5, 3, 1.6]),
-        options=options,
+        settings=settings,
         spp=1,
         falloff=0.1,
         ceiling=None,

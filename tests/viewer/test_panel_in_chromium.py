@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 import nerg_mi as nerg
-from nerg_mi.viewer.serve import open_viewer
-from nerg_mi.workflows.scene_commands import ViewOptions
+from nerg_mi.viewer.serve import view
 from tests.viewer.browser import chromium, require
 from tests.viewer.conftest import ROOM, write_gaze_fields
 from tests.viewer.test_in_chromium import drag, until
@@ -149,17 +148,19 @@ def make_rays() -> nerg.Rays:
 
 @pytest.fixture(scope="module")
 def running(tmp_path_factory):
-    from nerg_mi.rendering.scene import activate_variant
-    from nerg_mi.workflows import demo
+    from nerg_mi.scenes.store import SCENE_FILE
+
+    from nerg_mi.cli import demo
+    from nerg_mi.environment.scene_loading import activate_variant
 
     require("viser")
     activate_variant("llvm_ad_rgb")
-    path = demo.find_store_scene()
+    path = SCENE_FILE
     if not all((path.parent / name).is_file() for name in demo.CHECKPOINTS.values()):
         pytest.skip("the store's fields are not here: python -m nerg_mi.scenes.store.make")
     rays = tmp_path_factory.mktemp("rays") / "rays.npz"
     make_rays().save(rays)
-    with open_viewer([path, rays], ViewOptions(port=0, width=48, spp=1, compile=False)) as viewer:
+    with view([path, rays], port=0, width=48, spp=1, compile=False) as viewer:
         yield viewer
 
 
@@ -268,9 +269,7 @@ def test06_area_is_drawn_and_saved(running, panel):
 def test07_gaze_field_can_be_switched(running, tmp_path):
     """One of two gaze fields lacks a factor: the list of layers and the pictures change."""
     (tmp_path / "room.xml").write_text(ROOM)
-    with open_viewer(
-        [tmp_path / "room.xml", *write_gaze_fields(tmp_path)], ViewOptions(port=0, width=48, spp=1, compile=False)
-    ) as viewer:
+    with view([tmp_path / "room.xml", *write_gaze_fields(tmp_path)], port=0, width=48, spp=1, compile=False) as viewer:
         session = viewer.page.session
         with chromium(900, 700) as driver:
             driver.get(viewer.address)

@@ -11,8 +11,7 @@ from nerg_mi.transport.geometry import Ceiling
 from nerg_mi.viewer.page import Page
 from nerg_mi.viewer.points import BandPace, PinholeView, refine
 from nerg_mi.viewer.scene import ParticipantsPanel, ViewSettings, copy_scene
-from nerg_mi.viewer.serve import open_viewer
-from nerg_mi.workflows.scene_commands import ViewOptions
+from nerg_mi.viewer.serve import view
 from tests.viewer.browser import require
 
 # ---- Copied scenes ----
@@ -94,7 +93,7 @@ def running(room, tmp_path):
     origin = np.stack([-2 + 0 * t, -1 + 0.5 * t, np.full(400, 1.6)], axis=1)
     rays = nerg.Rays(t, np.zeros(400, int), ("Ada",), origin, np.tile([0.0, 0.8, -0.6], (400, 1)), np.ones(400))
     rays.save(tmp_path / "rays.npz")
-    with open_viewer([room, tmp_path / "rays.npz"], ViewOptions(port=0)) as viewer:
+    with view([room, tmp_path / "rays.npz"], port=0) as viewer:
         yield viewer
 
 

@@ -3,24 +3,28 @@
 from __future__ import annotations
 
 import http.client
+import os
+import signal
 import socket
 import sys
+import threading
 import time
 from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
 
+from nerg_mi.cli import signatures
+from nerg_mi.cli.signatures import make_command
+from nerg_mi.cli.table import ROWS
 from nerg_mi.errors import NergError
-from nerg_mi.viewer import serve
 from nerg_mi.viewer.page import BrowserWindow
 from nerg_mi.viewer.points import NUM_LEVELS
-from nerg_mi.viewer.serve import open_viewer, view_files
+from nerg_mi.viewer.serve import view
 from nerg_mi.viewer.server import MAX_CLIENTS, MAX_MESSAGE_BYTES, RequestGuard, is_loopback, make_token, start_server
-from nerg_mi.workflows.view import ViewOptions
+from tests.recorder import Recorder
 from tests.viewer import browser
 from tests.viewer.browser import require
-from tests.workflows.recorder import Recorder
 
 # ---- Access control ----
 
@@ -294,7 +298,7 @@ def get_status(address: str) -> int:
 
 @pytest.mark.usefixtures("_viser")
 def test19_viewer_runs_within_the_block(room):
-    with open_viewer([room], ViewOptions(port=0)) as running:
+    with view([room], port=0) as running:
         assert get_status(running.address) == 200 and urlsplit(running.address).hostname == "127.0.0.1"
         address = running.address
     with pytest.raises(ConnectionError):
@@ -303,14 +307,14 @@ def test19_viewer_runs_within_the_block(room):
 
 @pytest.mark.usefixtures("_viser")
 def test20_other_host_has_a_token(room):
-    with open_viewer([room], ViewOptions(host="0.0.0.0", port=0)) as running:
+    with view([room], host="0.0.0.0", port=0) as running:
         assert get_status(running.address) == 200
         assert get_status(running.address.partition("?")[0]) == 403
 
 
 @pytest.mark.usefixtures("_viser")
 def test21_page_moves_the_observer(room):
-    with open_viewer([room], ViewOptions(port=0)) as running:
+    with view([room], port=0) as running:
         page, session = running.page, running.page.session
         page.place_observer(np.array([3.0, 0, 0.5]), np.eye(3))
         assert np.allclose(page._observer.position, [3, 0, 0.5]) and np.allclose(page._observer.wxyz, [1, 0, 0, 0])
@@ -324,23 +328,25 @@ def test21_page_moves_the_observer(room):
 
 
 @pytest.mark.usefixtures("_viser")
-def test22_view_files_runs_until_ctrl_c(room, monkeypatch):
-    recorder = Recorder()
+def test22_the_command_serves_until_ctrl_c(room, monkeypatch):
+    class Interrupting(Recorder):
+        def message(self, text):
+            super().message(text)
+            if text == "press Ctrl-C to stop":
+                threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
 
-    def interrupted():
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(serve, "_wait", interrupted)
-    view_files([room], ViewOptions(port=0), recorder)
-    assert any(text.startswith("open http://127.0.0.1:") for text in recorder.messages)
-    assert recorder.messages[-1] == "the viewer has stopped"
+    recorder, command = Interrupting(), make_command(ROWS["view"])
+    monkeypatch.setattr(signatures, "lower_priority", lambda: None)
+    command.run(inputs=[room], options=command.options(port=0, mode="llvm_ad_rgb"), reporter=recorder)
+    (address,) = [text.removeprefix("open ") for text in recorder.messages if text.startswith("open http://127.0.0.1:")]
+    with pytest.raises(ConnectionError):
+        get_status(address)
 
 
 @pytest.mark.usefixtures("_viser")
 def test23_missing_files_are_reported(tmp_path):
     with pytest.raises(NergError, match="no file"):
-        with open_viewer([tmp_path / "a.xml"], ViewOptions(port=0)):
-            pass
+        view([tmp_path / "a.xml"], port=0)
 
 
 # ---- Point levels ----

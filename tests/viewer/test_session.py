@@ -11,16 +11,20 @@ import numpy as np
 import pytest
 
 import nerg_mi as nerg
+from nerg_mi.environment.nested_scene import replace_gaze
 from nerg_mi.errors import NergError
-from nerg_mi.formats.areas import Region
+from nerg_mi.formats.boxes import Region
 from nerg_mi.maths.geometry import Similarity
-from nerg_mi.rays.rays import Rays
-from nerg_mi.rendering.nested_scene import replace_gaze
+from nerg_mi.tracking.rays import Rays
 from nerg_mi.transport.mitsuba_mesh import make_mesh, read_triangles
 from nerg_mi.viewer import session as module
+from nerg_mi.viewer import shares as sums
 from nerg_mi.viewer.layers import get_layer
 from nerg_mi.viewer.page import Page
-from nerg_mi.viewer.session import ALL_PARTICIPANTS, MAX_GAP, AttentionShare, Listener, Session, Tracks, Worker
+from nerg_mi.viewer.session import Listener, Session
+from nerg_mi.viewer.shares import AttentionShare
+from nerg_mi.viewer.tracks import ALL_PARTICIPANTS, MAX_GAP, Tracks
+from nerg_mi.viewer.worker import Worker
 from tests.refusals import mentions
 
 # ---- Listener ----
@@ -220,7 +224,7 @@ def test09_invalid_input_is_reported(make_session, room, tmp_path):
     with pytest.raises(NergError, check=mentions("observer")):
         make_session(room, observer=(1.0, 2.0))
     for wrong in (float("nan"), float("-inf"), 1e30):
-        with pytest.raises(NergError, match="observer must lie in"):
+        with pytest.raises(NergError, match="invalid observer position"):
             make_session(room, observer=(1.0, 2.0, wrong))
 
 
@@ -296,8 +300,8 @@ def test12_areas_and_meshes_in_steps(scene, monkeypatch):
         Region.create("left", (0, 0.5, -0.1), (2, 2, 0.4)),
         Region.create("right", (0, -2, -0.1), (2, -0.5, 0.4)),
     ]
-    monkeypatch.setattr(module, "SHAPES_PER_STEP", 1)
-    steps = list(module.iter_attention_shares(scene, AT, regions, ["floor", "box"]))
+    monkeypatch.setattr(sums, "SHAPES_PER_STEP", 1)
+    steps = list(sums.iter_attention_shares(scene, AT, regions, ["floor", "box"]))
     assert [sorted(step) for step in steps] == 2 * [["left", "right"], ["floor"], ["box"]]
     one = nerg.attention(scene, regions[0].corners, observers=AT[None])
     left, preliminary = steps[3]["left"], steps[0]["left"]
@@ -315,7 +319,7 @@ def test21_meshes_are_seen_from_both_sides(scene):
             other = nerg.make_scene(
                 gaze=scene.integrator.children["gaze"].filename, shapes={"box": make_mesh(vertices, f, "box")}
             )
-            *_, step = module.iter_attention_shares(other, np.asarray(eye), [], ["box"])
+            *_, step = sums.iter_attention_shares(other, np.asarray(eye), [], ["box"])
             shares.append(step["box"].share)
     assert shares[0] == pytest.approx(shares[1]) and shares[0] > 0
     assert shares[2:] == pytest.approx([1, 1], abs=1e-3)
@@ -331,7 +335,7 @@ def test27_final_shares_are_within_their_accuracy():
 
 
 def test13_no_areas_and_no_shapes(scene):
-    assert list(module.iter_attention_shares(scene, AT, [], [])) == []
+    assert list(sums.iter_attention_shares(scene, AT, [], [])) == []
 
 
 # ---- Recordings ----

@@ -15,19 +15,18 @@ from scipy.spatial.transform import Rotation
 from nerg_mi.errors import NergError
 from nerg_mi.maths.color import psnr
 from nerg_mi.photos.cameras import pixel_directions
+from nerg_mi.train import radiance as workflow
+from nerg_mi.train.radiance import train_radiance
 from nerg_mi.train.radiance_run import train_field
 from nerg_mi.train.radiance_settings import RadianceSettings
 from nerg_mi.viewer import training
 from nerg_mi.viewer.points import PinholeView
 from nerg_mi.viewer.training import MAX_FRACTION, TrainingPage, make_camera_view, open_training_page
-from nerg_mi.workflows import train_radiance as workflow
-from nerg_mi.workflows.radiance_commands import RadianceOptions
-from nerg_mi.workflows.train_radiance import train_radiance
+from tests.recorder import Recorder
 from tests.tiny import ball_pose, write_photos
 from tests.train.radiance.ball import TINY, ball, ball_dataset, settings, trainer
 from tests.viewer.browser import require
 from tests.viewer.test_server import get_status
-from tests.workflows.recorder import Recorder
 
 # ---- Cameras ----
 
@@ -245,8 +244,8 @@ def test07_a_command_with_a_page(photos, tmp_path, monkeypatch):
         statuses.append(get_status(page.address))
 
     monkeypatch.setattr(TrainingPage, "on_step", observe)
-    result = train_radiance(photos, tmp_path / "a.safetensors", RadianceOptions(**OPTIONS), recorder)
-    assert statuses == [200] * 4 and result.output.is_file()
+    result = train_radiance(photos, **OPTIONS, output=tmp_path / "a.safetensors", progress=recorder)
+    assert statuses == [200] * 4 and result.path.is_file()
     (opened,) = (text for text in recorder.messages if text.startswith("open http://127.0.0.1:"))
     with pytest.raises(ConnectionError):
         get_status(opened.split()[1])
@@ -263,8 +262,8 @@ def test08_a_failing_page_does_not_end_the_training(photos, tmp_path, monkeypatc
         raise RuntimeError("no page")
 
     monkeypatch.setattr(TrainingPage, "on_step", fail)
-    result = train_radiance(photos, tmp_path / "a.safetensors", RadianceOptions(**OPTIONS), recorder)
-    assert result.provenance["steps"] == 4 and result.output.is_file()
+    result = train_radiance(photos, **OPTIONS, output=tmp_path / "a.safetensors", progress=recorder)
+    assert result.provenance["steps"] == 4 and result.path.is_file()
     (warning,) = (text for text in recorder.warnings if "page" in text)
     assert "RuntimeError: no page" in warning and "training continues" in warning
 
@@ -274,10 +273,10 @@ def test09_missing_viser_and_a_used_port_are_refused_before_the_training(tmp_pat
     with open_training_page(0) as page:
         port = page.server.get_port()
         with pytest.raises(NergError, match="choose another with port"):
-            train_radiance(tmp_path, None, RadianceOptions(**{**OPTIONS, "port": port}))
+            train_radiance(tmp_path, **{**OPTIONS, "port": port})
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(NergError, match=r'pip install "nerg-mi\[viewer\]"'):
-        train_radiance(tmp_path, None, RadianceOptions(**OPTIONS))
+        train_radiance(tmp_path, **OPTIONS)
 
 
 def test10_the_panel_is_supported_by_viser():

@@ -6,7 +6,7 @@ import numpy as np
 from typer.testing import CliRunner
 
 from nerg_mi.cli import build_app
-from nerg_mi.rays.rays import Rays
+from nerg_mi.tracking.rays import Rays
 
 
 def run(*arguments):

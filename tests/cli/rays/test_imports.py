@@ -4,13 +4,12 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.rays.rays import Rays
-from nerg_mi.rays.readers.skeleton import keypoints_from_head, write_skeleton
+from nerg_mi.tracking.rays import Rays
+from nerg_mi.tracking.readers.skeleton import keypoints_from_head, write_skeleton
 from tests.cli.rays.running import run
 
 MAP = ["--map", "origin=x,y,z direction=a,b,c t=t"]
 UNITY = ["--up", "y", "--hand", "left"]
-ALONE = ["--workers", 1]
 ROWS = "t,x,y,z,a,b,c\n0,1,1.6,2,0,0,1\n1,1,1.6,2,0,0,1\n"
 
 
@@ -43,7 +42,6 @@ def test_import_by_map(tmp_path):
         ([], "the format of the files is not given"),
         (["--preset", "vr_supermarket", "--up", "y"], "up"),
         ([*MAP, "--marker", 0.05], "marker"),
-        ([*MAP, "--salt", "salt"], "salt"),
         (["--preset", "skeleton", "--keypoints", "1,2"], "keypoints"),
         (["--preset", "skeleton", "--tick", 0], "tick"),
         (["--preset", "skeleton", "--tick", "nan"], "tick"),
@@ -75,7 +73,7 @@ def test_pseudonyms_replace_names(tmp_path):
     hidden = []
     for files in (["anna", "bo"], ["bo"]):
         paths = [tmp_path / f"{n}.csv" for n in files]
-        done = run("import", *paths, "-o", tmp_path / "r.npz", *MAP, "--pseudonyms", "--salt", tmp_path / "salt")
+        done = run("import", *paths, "-o", tmp_path / "r.npz", *MAP, "--pseudonyms", tmp_path / "salt")
         assert done.exit_code == 0, done.output
         hidden.append(Rays.load(tmp_path / "r.npz"))
         assert "anna" not in done.output.replace(str(tmp_path), "") and "anna" not in str(hidden[-1].metadata)
@@ -130,9 +128,9 @@ def test_files_with_faults_can_be_found_despite_pseudonyms(tmp_path, output):
         pytest.importorskip("pyarrow")
     (tmp_path / "ann.csv").write_text(ROWS)
     (tmp_path / "berta.csv").write_text(ROWS + "2,1,1.6,2,0,0,0\n")
-    salt = [] if output == "r.npz" else ["--salt", tmp_path / "salt", *ALONE]
     (tmp_path / "salt").write_bytes(b"s" * 32)
-    command = [*MAP, *UNITY, "--person-from", "filename", "--pseudonyms", *salt]
+    salt = "random" if output == "r.npz" else tmp_path / "salt"
+    command = [*MAP, *UNITY, "--person-from", "filename", "--pseudonyms", salt]
     done = run("import", tmp_path / "ann.csv", tmp_path / "berta.csv", "-o", tmp_path / output, *command)
     assert done.exit_code == 0, done.output
     (line,) = [line for line in done.output.splitlines() if "berta.csv" in line]
@@ -141,25 +139,3 @@ def test_files_with_faults_can_be_found_despite_pseudonyms(tmp_path, output):
     written = [tmp_path / output] if output == "r.npz" else (tmp_path / output).rglob("*")
     assert not any(b"berta" in path.read_bytes() for path in written if path.is_file())
     assert "berta" not in str(run("show", tmp_path / output).output)
-
-
-def test_all_refused_files_of_a_dataset_are_named(tmp_path):
-    pytest.importorskip("pyarrow")
-    for name in ("ann", "bo", "cy"):
-        (tmp_path / f"{name}.csv").write_text(
-            ROWS.replace("1.6", "1.6" if name == "ann" else "x" if name == "bo" else "1e5")
-        )
-    files = [tmp_path / f"{name}.csv" for name in ("ann", "bo", "cy")]
-    done = run("import", *files, "-o", tmp_path / "r.rays", *MAP, *UNITY, *ALONE, "--pseudonyms")
-    text = done.output + str(done.exception)
-    assert done.exit_code != 0 and "bo.csv" in text and "cy.csv" in text and "2 of 3 files" in text
-
-
-def test_files_without_rays_are_named(tmp_path):
-    pytest.importorskip("pyarrow")
-    (tmp_path / "ann.csv").write_text(ROWS)
-    (tmp_path / "bo.csv").write_text("t,x,y,z,a,b,c\n0,1,1.6,2,0,0,0\n")
-    done = run("import", tmp_path / "ann.csv", tmp_path / "bo.csv", "-o", tmp_path / "r.rays", *MAP, *UNITY, *ALONE)
-    assert done.exit_code == 0, done.output
-    (line,) = [line for line in done.output.splitlines() if "gives a ray" in line]
-    assert "bo.csv" in line and "ann" not in line

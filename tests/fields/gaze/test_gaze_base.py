@@ -19,7 +19,7 @@ from nerg_mi.fields.gaze_base import (
 )
 from nerg_mi.fields.gaze_hits import ReaimedHits
 from nerg_mi.fields.gaze_log_density import LogGazeField
-from nerg_mi.fields.gaze_product import GazeConfig, GazeField
+from nerg_mi.fields.gaze_product import GazeConfig, ProductHead
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.formats.fields import load_gaze, save_gaze
 from nerg_mi.maths.geometry import Box
@@ -78,7 +78,7 @@ def fields():
     ns = namespace("llvm")
     log = [LogGazeField.random(SMALL, BOX, ns, seed) for seed in (1, 2)]
     return {
-        "product": GazeField.random(GazeConfig(GRID, width=16), BOX, ns),
+        "product": ProductHead.random(GazeConfig(GRID, width=16), BOX, ns),
         "log_density": log[0],
         "ensemble": GazeEnsemble(log),
     }

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.fields.encoding import HashGridConfig
-from nerg_mi.fields.gaze_product import ACTIVATIONS, VARIANTS, GazeConfig, GazeField, activate, softplus
+from nerg_mi.fields.gaze_product import ACTIVATIONS, VARIANTS, GazeConfig, ProductHead, activate, softplus
 from nerg_mi.maths.geometry import Box
 from tests.reference import fields_numpy as reference
 
@@ -16,7 +16,7 @@ BOX = Box((-1, 0, 2), (3, 2, 4))
 
 def make(variant="emit_capture", activation="softplus", gain=3.0):
     config = GazeConfig(HashGridConfig(**GRID), variant, activation, width=16, geometry=7)
-    field = GazeField.random(config, BOX, ns, 3)
+    field = ProductHead.random(config, BOX, ns, 3)
     rng = np.random.default_rng(3)
     values = {"grid.table": ns.Float(gain * rng.normal(size=len(field.grid.table)).astype(np.float32))}
     values |= {k: v * gain for k, v in field.parameters().items() if k.endswith("head.0")}

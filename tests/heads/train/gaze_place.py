@@ -5,6 +5,7 @@ import numpy as np
 from nerg_mi.fields.gaze_place import PlaceConfig, PlaceField
 
 from .gaze_recipes import Recipe, register_recipe
+from .gaze_settings import GazeSettings, ProbeSettings
 from .gaze_trainer import GazeTrainer, compute_gaze_loss
 
 
@@ -12,13 +13,14 @@ class PlaceTrainer(GazeTrainer):
     def init_field(self):
         return PlaceField.random(self.config, self.box, self.ns, self.settings.seed, self._targets.prior_table)
 
-    def backward(self):
+    def draw_batch(self):
         data, D = self.data, self.data.num_directions
         observers = self.rng.choice(data.num_observers, min(self.settings.probes, data.num_observers), replace=False)
-        batch = data.gather_batch(observers, np.broadcast_to(np.arange(D), (len(observers), D)))
+        return data.gather_batch(observers, np.broadcast_to(np.arange(D), (len(observers), D)))
+
+    def compute_loss(self, batch):
         density = self.evaluate_density(batch, self.current_parameters())
-        self.loss = compute_gaze_loss(density, batch.truth, D, cc=0, mae=0).total
-        dr.backward(self.loss)
+        return compute_gaze_loss(density, batch.truth, self.data.num_directions, cc=0, mae=0).total
 
     def evaluate_density(self, batch, parameters):
         self.initial_field.set_parameters(parameters)
@@ -38,15 +40,10 @@ register_recipe(
         make_config=lambda choices: PlaceConfig(variant=choices.variant),
         trainer=PlaceTrainer,
         losses=("likelihood",),
-        settings={
-            "steps": 12,
-            "validation_zones": 0,
-            "loss": "likelihood",
-            "integral_weight": 0.0,
-            "probes": 8,
-            "prior_folds": 2,
-        },
-        probes={"radius": 0.5, "probes": 16, "min_rays": 8, "directions": 64},
-        supported_options=frozenset({"prior-folds", "prior-kappa"}),
+        settings=GazeSettings(
+            steps=12, validation_zones=0, loss="likelihood", integral_weight=0.0, probes=8, prior_folds=2
+        ),
+        probes=ProbeSettings(radius=0.5, probes=16, min_rays=8, directions=64),
+        supported_options=frozenset({"prior_folds", "prior_kappa"}),
     )
 )

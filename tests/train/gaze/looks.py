@@ -12,13 +12,13 @@ from nerg_mi.fields.gaze_product import GazeConfig
 from nerg_mi.maths.geometry import Box
 from nerg_mi.photos.cameras import Intrinsics, PosedCamera, pixel_directions
 from nerg_mi.photos.salience import SalienceView, pixel_solid_angles
-from nerg_mi.rays.rays import Rays
+from nerg_mi.tracking.rays import Rays
 from nerg_mi.train.gaze_data import Supervision
 from nerg_mi.train.gaze_log_density import LikelihoodTrainer
 from nerg_mi.train.gaze_product import ProductTrainer
-from nerg_mi.train.gaze_run import train_gaze
+from nerg_mi.train.gaze_recipes import GazePlan
+from nerg_mi.train.gaze_run import StateSettings, fit_gaze
 from nerg_mi.train.gaze_settings import GazeSettings, ProbeSettings
-from nerg_mi.train.gaze_trainer import GazePlan, StateSettings
 
 BOX = Box((-2, -2, 0), (2, 2, 3))
 GRID = HashGridConfig(levels=2, log2_rows=10, base=4, finest=8)
@@ -63,7 +63,7 @@ def train(place, settings, config, probes=PROBES, supervision=None, *, on_progre
     """Train on ``RAYS``, unless other data are given; ``state`` are arguments of `StateSettings`."""
     plan = planned(config, settings, probes)
     supervision = supervision or Supervision(RAYS)
-    return train_gaze(supervision, place, plan, ns, state=StateSettings(**state), on_progress=on_progress, write=write)
+    return fit_gaze(supervision, place, plan, ns, state=StateSettings(**state), on_progress=on_progress, write=write)
 
 
 def stopping(stage, step):

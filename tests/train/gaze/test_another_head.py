@@ -16,13 +16,12 @@ from nerg_mi.fields import gaze_base
 from nerg_mi.fields.gaze_base import GazeEnsemble
 from nerg_mi.formats.fields import load_gaze, save_gaze
 from nerg_mi.train import gaze_recipes
-from nerg_mi.workflows.gaze_commands import GazeOptions
-from nerg_mi.workflows.train_gaze import train_gaze
+from nerg_mi.train.gaze import train_gaze
 from tests.evaluation.test_gaze import crowd
 from tests.plugins.scenes import camera, look_at, render
 
 HEADS = Path(__file__).parents[2] / "heads"
-OPTIONS = GazeOptions(recipe="place", geometry="hits", voxel_size=0.3, threads=1, min_rays=4, seed=1)
+OPTIONS = {"recipe": "place", "voxel_size": 0.3, "min_rays": 4, "seed": 1}
 
 
 @pytest.fixture(scope="module")
@@ -42,11 +41,11 @@ def head():
 
 @pytest.fixture(scope="module")
 def trained(head, tmp_path_factory):
-    return train_gaze(crowd(3000), tmp_path_factory.mktemp("head") / "gaze.safetensors", OPTIONS)
+    return train_gaze(crowd(3000), "hits", **OPTIONS, output=tmp_path_factory.mktemp("head") / "gaze.safetensors")
 
 
 def test_its_recipe_trains_and_folds_select_the_weight(head, trained):
-    field, provenance = trained.field, trained.provenance
+    field, provenance = trained.network, trained.provenance
     assert isinstance(field, head.PlaceField) and provenance["recipe"] == "place" and provenance["steps"] == 12
     assert provenance["mix"]["folds"] == 2 and field.config.mix == provenance["mix"]["mix"] > 0
     untrained = head.PlaceField.random(field.config, field.box, ns, 1, field.prior.numpy()).parameters()
@@ -56,16 +55,16 @@ def test_its_recipe_trains_and_folds_select_the_weight(head, trained):
 
 def test_it_is_stored_rendered_and_a_torch_module(rgb, trained, tmp_path):
     path = tmp_path / "gaze.safetensors"
-    save_gaze(trained.field, path, {})
+    save_gaze(trained.network, path, {})
     again, meta = load_gaze(path, ns)
-    assert meta["architecture"]["kind"] == "place" and again.config == trained.field.config
+    assert meta["architecture"]["kind"] == "place" and again.config == trained.network.config
     parts = {"gaze": {"type": "gazefield", "filename": str(path)}, "aovs": "gaze,emit,capture"}
     sensor = {**camera(rgb, size=8, fov=45), "to_world": look_at(rgb, (0, 0, 1.5), (1.5, 0, 1.2), (0, 0, 1))}
     ball = {"type": "sphere", "center": [1.5, 0, 1.2], "radius": 0.5}
     gaze = render(rgb, {"type": "nerg", **parts}, sensor, ball=ball)[..., 3]
     assert np.isfinite(gaze).all() and gaze[3:5, 3:5].min() > 0
     torch = pytest.importorskip("torch")
-    from nerg_mi.interop.torch import GazeModule
+    from nerg_mi.fields.torch_modules import GazeModule
 
     # The networks have influence, whatever the folds select.
     again.set_prior(0.1)
@@ -81,7 +80,7 @@ def test_it_is_stored_rendered_and_a_torch_module(rgb, trained, tmp_path):
 
 
 def test_members_of_an_ensemble_are_of_its_kind(head, trained, tmp_path):
-    field = trained.field
+    field = trained.network
     both = GazeEnsemble([field, head.PlaceField.random(field.config, field.box, ns, 2, field.prior.numpy())])
     save_gaze(both, tmp_path / "both.safetensors", {})
     again = load_gaze(tmp_path / "both.safetensors", ns)[0]

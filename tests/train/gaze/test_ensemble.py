@@ -12,10 +12,10 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.fields.gaze_base import DataSummary
 from nerg_mi.formats.checkpoint import write_checkpoint
-from nerg_mi.rays.rays import Rays
+from nerg_mi.tracking.rays import Rays
 from nerg_mi.train.gaze_data import Supervision
 from nerg_mi.train.gaze_ensemble import assign_blocks, resample_rays, resample_views, train_ensemble
-from nerg_mi.train.gaze_trainer import StateSettings
+from nerg_mi.train.gaze_run import StateSettings
 
 from .looks import LIKELIHOOD, LOG, NOWHERE, PROBES, around, looking_at, planned, train
 
@@ -113,7 +113,7 @@ def test_an_interrupted_ensemble_resumes(threads, tmp_path):
     with pytest.raises(KeyboardInterrupt, match="2.*3.*resume"):
         together(path=path, on_progress=stop)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.member0.safetensors", "a.run"]
-    with pytest.raises(NergError, match="started with different probes"):
+    with pytest.raises(NergError, match=r"started with different probes\.kappa"):
         together(path=path, resume=True, probes=replace(PROBES, kappa=9.0))
     seen.clear()
     written = []

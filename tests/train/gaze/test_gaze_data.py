@@ -15,16 +15,16 @@ from nerg_mi.environment.environment import Environment
 from nerg_mi.errors import NergError
 from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.gaze_base import interpolate_table, table_directions
-from nerg_mi.fields.gaze_product import GazeField
+from nerg_mi.fields.gaze_product import ProductHead
 from nerg_mi.fields.mlp import namespace
-from nerg_mi.fields.radiance import RadianceConfig, RadianceField
+from nerg_mi.fields.radiance import RadianceConfig, RadianceNetwork
 from nerg_mi.formats.fields import save_gaze, save_radiance
 from nerg_mi.maths import vmf
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.photos.salience import pixel_solid_angles
-from nerg_mi.probes.probes import place_probes
-from nerg_mi.rays.rays import Rays
+from nerg_mi.tracking.probes import place_probes
+from nerg_mi.tracking.rays import Rays
 from nerg_mi.train.gaze_data import (
     GazeTargets,
     Supervision,
@@ -34,20 +34,14 @@ from nerg_mi.train.gaze_data import (
     compute_semantic_features,
     compute_surface_distances,
     concatenate_targets,
-    hold_out,
     make_observer_targets,
-    make_prior_from_rays,
-    make_prior_from_views,
     make_probes,
     make_rotated_directions,
     make_targets_from_probes,
     make_targets_from_rays,
     make_targets_from_views,
-    select_far_views,
-    select_prior_kappa,
-    split_validation,
-    split_views,
 )
+from nerg_mi.train.gaze_folds import hold_out, select_far_views, split_validation, split_views
 from nerg_mi.train.gaze_log_density import LikelihoodTrainer
 from nerg_mi.train.gaze_product import (
     ProductTrainer,
@@ -57,6 +51,7 @@ from nerg_mi.train.gaze_product import (
     match_trunk_config,
 )
 from nerg_mi.train.gaze_settings import GazeSettings, ProbeSettings
+from nerg_mi.train.prior import make_prior_from_rays, make_prior_from_views, select_prior_kappa
 from nerg_mi.transport.field_medium import FieldMedium
 from nerg_mi.transport.geometry import default_march_settings
 from tests.fields.gaze.test_log_density import SMALL as VIEW_TARGETS_SMALL
@@ -292,7 +287,7 @@ def radiance(rgb):
     config = RadianceConfig(
         HashGridConfig(levels=2, log2_rows=10, base=4, finest=8), width=16, geometry=5, sh_degree=2, density_scale=6.0
     )
-    field = RadianceField.random(config, BOX, ns, 0, march_step=0.1)
+    field = RadianceNetwork.random(config, BOX, ns, 0, march_step=0.1)
     table = np.random.default_rng(0).normal(size=len(field.grid.table)).astype(np.float32)
     field.set_parameters({"grid.table": ns.Float(table)})
     return field
@@ -300,7 +295,7 @@ def radiance(rgb):
 
 def test01_the_trunk_gives_the_fields_features(radiance):
     ns = namespace("llvm")
-    gaze = GazeField.random(gaze_config(radiance), BOX, ns, 3)
+    gaze = ProductHead.random(gaze_config(radiance), BOX, ns, 3)
     gaze.set_parameters(extract_initial_weights(radiance, gaze.config))
     p = ns.Array3f(np.random.default_rng(2).uniform(BOX.lower, BOX.upper, (50, 3)).astype(np.float32).T)
     expected = radiance.density_features(p)[1]
@@ -316,7 +311,7 @@ def test01_the_trunk_gives_the_fields_features(radiance):
 def test02_the_fast_path_is_the_field(radiance, with_own_features):
     ns, rng = namespace("llvm"), np.random.default_rng(3)
     config = gaze_config(radiance, semantic="snapshot", semantic_own=with_own_features)
-    gaze = GazeField.random(config, BOX, ns, 3)
+    gaze = ProductHead.random(config, BOX, ns, 3)
     gaze.set_parameters({"grid.table": ns.Float(rng.normal(size=len(gaze.grid.table)).astype(np.float32))})
     B, D = 3, 32
     p_o, p_od = (ns.Array3f(rng.uniform(BOX.lower, BOX.upper, (n, 3)).astype(np.float32).T) for n in (B, B * D))
@@ -353,7 +348,7 @@ def test_features_of_training_are_those_of_rendering(rgb, radiance, tmp_path, mo
     """Independent of the colour cut-off of the picture: rendering must provide the features of the training."""
     save_radiance(radiance, tmp_path / "field.safetensors", {})
     config = gaze_config(radiance, "emit", semantic=kind)
-    save_gaze(GazeField.random(config, BOX, namespace("llvm"), 3), tmp_path / "gaze.safetensors", {})
+    save_gaze(ProductHead.random(config, BOX, namespace("llvm"), 3), tmp_path / "gaze.safetensors", {})
     integrator = with_gaze(tmp_path, "opacity,position,gaze", depth="median")
     if cutoff is not None:
         integrator["color_cutoff"] = cutoff
@@ -541,8 +536,8 @@ def test_the_likelihood_is_conditioned_on_the_view():
     assert scores.kld == pytest.approx(np.mean(np.sum(part * np.log(data.truth / density), axis=1)), abs=1e-4)
     assert scores.mae == pytest.approx(np.abs(density - data.truth).mean(), rel=1e-3)
     assert scores.integral == pytest.approx(1, abs=1e-5)
-    trainer.backward()
-    assert float(trainer.loss[0]) == pytest.approx(np.mean(np.sum(-part * np.log(density), axis=1)), abs=0.02)
+    loss = trainer.compute_loss(trainer.draw_batch())
+    assert float(loss[0]) == pytest.approx(np.mean(np.sum(-part * np.log(density), axis=1)), abs=0.02)
 
 
 def test_the_losses_of_a_density_do_not_see_its_scale_through_views():

@@ -12,7 +12,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.fields.gaze_hits import FAR
 from nerg_mi.formats.checkpoint import read_checkpoint, write_checkpoint
 from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.rays.rays import Rays
+from nerg_mi.tracking.rays import Rays
 from nerg_mi.train.gaze_data import Supervision
 from nerg_mi.train.gaze_ensemble import train_ensemble
 from nerg_mi.train.gaze_folds import (
@@ -22,7 +22,6 @@ from nerg_mi.train.gaze_folds import (
     FoldDensities,
     FoldResults,
     PriorSelection,
-    StagedProgress,
     _calibrate_regions,
     _evaluate_hit_kernels,
     _round_values,
@@ -30,9 +29,9 @@ from nerg_mi.train.gaze_folds import (
     _select_weight,
     evaluate_folds,
 )
-from nerg_mi.train.gaze_run import train_gaze
+from nerg_mi.train.gaze_run import KIND, StateSettings, fit_gaze
 from nerg_mi.train.gaze_settings import ProbeSettings
-from nerg_mi.train.gaze_trainer import KIND, GazeProgress, StateSettings
+from nerg_mi.train.gaze_trainer import GazeProgress, StagedProgress
 from tests.fields.gaze.test_hits import reference
 
 from .looks import LIKELIHOOD, LOG, NOWHERE, planned
@@ -119,6 +118,26 @@ def test03_the_weight_maximises_the_held_out_likelihood():
     assert result.folds == 2 and result.prior_kappa == 20.0  # noqa: RUF069 (stored)
 
 
+def test03a_bits_with_weights_of_other_folds():
+    """The participant of the first fold is predicted by the field, and that of the second by the prior."""
+    person, uniform, min_weight = np.zeros(1, int), np.full((1, 8), 1 / (4 * np.pi)), PRIOR_WEIGHTS[0]
+    densities = ((1.0, 0.1), (0.01, 1.0))
+    folds = [make_fold(person, np.array([f]), np.array([p]), uniform, uniform) for f, p in densities]
+    assert [FoldResults(0.1, 20.0, [fold]).select().prior_weight for fold in folds] == [min_weight, 1.0]
+    assert FoldResults(0.1, 20.0, folds[:1]).select().bits_crossed is None
+    # The first participant with the weight of the second, and the second with that of the first.
+    crossed = 0.5 * (0 + np.log2((1 - min_weight) * 0.01 + min_weight * 1.0))
+    selection = FoldResults(0.1, 20.0, folds).select()
+    assert selection.bits_crossed == pytest.approx(crossed) and selection.bits > selection.bits_crossed
+    # Equal folds select equal weights.
+    same = FoldResults(0.1, 20.0, [folds[0], folds[0]]).select()
+    assert (
+        same.bits_crossed
+        == pytest.approx(same.bits)
+        == np.log2((1 - min_weight) * 1.0 + min_weight * 0.1) - np.log2(0.1)
+    )
+
+
 def test03b_hits_have_weight_only_if_they_improve_the_mixture():
     """Field, prior and the hits with one of the kernels hold for a third of the rays each."""
     third = np.tile(np.eye(3), (20, 1)) + 0.01
@@ -178,7 +197,7 @@ def test04_the_field_has_weight_if_position_is_informative(law, has_weight, rgb)
 def test05_of_a_training_and_of_an_ensemble(rgb):
     rays = people(0.0)
     plan = plan_of(steps=20)
-    field, provenance = train_gaze(Supervision(rays), NOWHERE, plan, ns)
+    field, provenance = fit_gaze(Supervision(rays), NOWHERE, plan, ns)
     assert (
         field.config.mix
         == provenance["mix"]["mix"]
@@ -187,7 +206,7 @@ def test05_of_a_training_and_of_an_ensemble(rgb):
     ensemble, provenance = train_ensemble(2, Supervision(rays), NOWHERE, plan, ns)
     assert [f.config.mix for f in ensemble.members] == [provenance["mix"]["mix"]] * 2
     # No position has enough rays to hold out, so the weight stays.
-    few, provenance = train_gaze(Supervision(people(0.0, each=12)), NOWHERE, plan, ns)
+    few, provenance = fit_gaze(Supervision(people(0.0, each=12)), NOWHERE, plan, ns)
     assert few.config.mix == LOG.mix and provenance["mix"]["mix"] == LOG.mix and provenance["mix"]["folds"] == 0
     assert provenance["mix"]["regions"] is None
     assert PriorSelection(0.5, 1, regions={"80%": 0.71234}).to_dict()["regions"] == {"80%": 0.7123}
@@ -197,7 +216,7 @@ def test05_of_a_training_and_of_an_ensemble(rgb):
         if progress.stage.startswith("fold"):
             raise KeyboardInterrupt
 
-    field, provenance = train_gaze(Supervision(rays), NOWHERE, plan, ns, on_progress=stop)
+    field, provenance = fit_gaze(Supervision(rays), NOWHERE, plan, ns, on_progress=stop)
     assert provenance["interrupted"] and "mix" not in provenance and field.config.mix == LOG.mix
 
 
@@ -264,7 +283,7 @@ def test02_the_variant_that_predicts_held_out_participants_is_trained(rgb):
     messages = []
     flat = replace(CAPTURE, sh_degree=1)
     plan = replace(two(), config=flat, alternatives=(replace(BOTH, reach=1.9, sh_degree=1),))
-    field, provenance = train_gaze(Supervision(people(1.0)), NOWHERE, plan, ns, on_progress=messages.append)
+    field, provenance = fit_gaze(Supervision(people(1.0)), NOWHERE, plan, ns, on_progress=messages.append)
     bits = provenance["mix"]["variants"]
     assert provenance["mix"]["variant"] == field.config.variant == "emit_capture"
     assert bits["emit_capture"] > bits["capture"] and field.config.mix == provenance["mix"]["mix"]
@@ -288,7 +307,7 @@ def test04_a_resumed_run_keeps_its_selection(members, tmp_path, rgb, monkeypatch
     def trained(**options):
         if members:
             return train_ensemble(members, supervision, NOWHERE, plan, ns, **options)
-        return train_gaze(supervision, NOWHERE, plan, ns, write=lambda field, provenance: None, **options)
+        return fit_gaze(supervision, NOWHERE, plan, ns, write=lambda field, provenance: None, **options)
 
     state = StateSettings(path=path, interval=0.0)
     if members:
@@ -319,7 +338,7 @@ def test04_a_resumed_run_keeps_its_selection(members, tmp_path, rgb, monkeypatch
     provenance = trained(state=replace(state, resume=True)).provenance
     assert not provenance["interrupted"] and provenance["mix"] == selected
     with pytest.raises(NergError, match="cannot resume"):
-        train_gaze(supervision, NOWHERE, plan, ns, state=StateSettings(path=tmp_path / "b.run", resume=True))
+        fit_gaze(supervision, NOWHERE, plan, ns, state=StateSettings(path=tmp_path / "b.run", resume=True))
 
 
 def test05_ctrl_c_during_folds_reports_that_no_state_is_saved(rgb):
@@ -328,4 +347,4 @@ def test05_ctrl_c_during_folds_reports_that_no_state_is_saved(rgb):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt, match="emit_capture"):
-        train_gaze(Supervision(people(1.0)), NOWHERE, two(), ns, on_progress=stop)
+        fit_gaze(Supervision(people(1.0)), NOWHERE, two(), ns, on_progress=stop)

@@ -11,11 +11,10 @@ import pytest
 
 from nerg_mi.evaluation import metrics
 from nerg_mi.fields.gaze_base import make_prior_table
-from nerg_mi.fields.gaze_product import GazeField
+from nerg_mi.fields.gaze_product import ProductHead
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.probes.probes import place_probes
-from nerg_mi.train import gaze_log_density, gaze_product
+from nerg_mi.tracking.probes import place_probes
 from nerg_mi.train.gaze_data import GazeTargets, make_targets_from_probes
 from nerg_mi.train.gaze_log_density import LikelihoodTrainer, evaluate_log_density, log_mean_exp
 from nerg_mi.train.gaze_product import ProductTrainer, evaluate_gaze_density
@@ -75,8 +74,7 @@ def test_the_loss_is_the_cross_entropy():
     trainer = LikelihoodTrainer(
         data, BOX, replace(SMALL, mix=0.0), replace(FAST, probes=3, directions=512, rays=8192), ns
     )
-    trainer.backward()
-    drawn = float(trainer.loss[0])
+    drawn = float(trainer.compute_loss(trainer.draw_batch())[0])
     scores = trainer.evaluate(data)
     entropy = -(4 * np.pi * data.truth * np.log(data.truth + 1e-30)).mean()
     assert drawn == pytest.approx(scores.kld + entropy, abs=0.01)
@@ -133,7 +131,8 @@ def test_the_fast_path_is_the_field(variant, escape):
 @pytest.mark.parametrize("variant", ["emit", "capture", "emit_capture"])
 def test_gradients_reach_what_the_variant_uses(variant):
     field, ns = made(replace(SMALL, variant=variant)), namespace("llvm")
-    parameters = gaze_log_density.select_trainable_parameters(field.config, field.parameters())
+    trained = LikelihoodTrainer(targets(1), BOX, field.config, FAST, ns).optimiser
+    parameters = {name: field.parameters()[name] for name in trained.keys()}
     dr.enable_grad(parameters)
     p_o, p_od, r = vectors(4)
     logit = evaluate_log_density(
@@ -184,7 +183,7 @@ def test_validation_objective_is_the_training_loss(rays, wall, loss, judged):
 @pytest.mark.parametrize("activation", ["softplus", "linear"])
 def test_the_fast_path_is_the_field_product(variant, activation):
     ns, rng = namespace("llvm"), np.random.default_rng(3)
-    field = GazeField.random(replace(PRODUCT, variant=variant, activation=activation, emit_scale=0.3), BOX, ns, 5)
+    field = ProductHead.random(replace(PRODUCT, variant=variant, activation=activation, emit_scale=0.3), BOX, ns, 5)
     # Random tables are near zero; features of size one reveal wrong indices.
     field.set_parameters({"grid.table": ns.Float(rng.normal(size=len(field.grid.table)).astype(np.float32))})
     B, D = 3, 7
@@ -201,7 +200,9 @@ def test_the_fast_path_is_the_field_product(variant, activation):
 def test_gradients_reach_what_the_variant_uses_product(variant):
     ns = namespace("llvm")
     config = replace(PRODUCT, variant=variant)
-    parameters = gaze_product.select_trainable_parameters(config, GazeField.random(config, BOX, ns, 5).parameters())
+    trained = ProductTrainer(targets(1), BOX, config, GazeSettings(steps=1), ns).optimiser
+    field = ProductHead.random(config, BOX, ns, 5).parameters()
+    parameters = {name: field[name] for name in trained.keys()}
     dr.enable_grad(parameters)
     p_o, r_o = ns.Array3f([0.1], [0.2], [1.0]), ns.Array3f([0, 0.6], [0.8, 0], [0.6, 0.8])
     dr.backward(

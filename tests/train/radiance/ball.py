@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import drjit.llvm.ad as ns
 import numpy as np
 
@@ -44,7 +46,7 @@ def ball_dataset():
     """Twenty training views of the ball, and four held-out views."""
     rng = np.random.default_rng(0)
     centers = rng.normal(size=(24, 3)) * [1, 1, 0.5]
-    views = [ball(ball_pose(2 * c / np.linalg.norm(c))) for c in centers]
+    views = [replace(ball(ball_pose(2 * c / np.linalg.norm(c))), name=f"ball {k}") for k, c in enumerate(centers)]
     return Dataset(views[4:], views[:4], BOX, "as given", [], {"dataset": "ball"})
 
 

@@ -17,7 +17,7 @@ from nerg_mi.train.radiance_diagnosis import Outcome, find_causes, find_problems
 def make_outcome(*psnr, steps=2000, stride=1, minutes: float | None = 2.0, seconds=120.0, result=None, training=None):
     history = [{"steps": 100 * (k + 1), "psnr": x, "psnr_train": training} for k, x in enumerate(psnr)]
     row = None if not psnr else history[-1 if result is None else result]
-    return Outcome(history, row, steps, stride, minutes, seconds)
+    return Outcome(history, row, psnr[-1] if psnr else None, steps, stride, minutes, seconds)
 
 
 def test_a_fall_of_held_out_views_is_reported():
@@ -70,6 +70,14 @@ def make_views(count=60, focal=lambda k: 50.0, picture=None, points=POINTS):
         lens = Intrinsics(64, 48, focal(k), focal(k), 32.0, 24.0)
         views.append(PhotoView(f"photo {k}", PosedCamera(lens, np.eye(4)), color, points=points))
     return views
+
+
+def test_views_that_chose_the_state_do_not_judge_it():
+    """The views that chose have 26 dB, and the others 18 dB."""
+    outcome = replace(make_outcome(26.0, training=27.0), psnr=18.0)
+    assert outcome.is_poor and outcome.gap == pytest.approx(9)
+    (line,) = find_problems(outcome, [])
+    assert "held-out views have 18.0 dB, training views 9.0 dB more" in line
 
 
 def test_sound_photos_have_no_causes():

@@ -8,7 +8,7 @@ import pytest
 from nerg_mi.maths.geometry import Box, ContractedBox
 from nerg_mi.photos.cameras import Intrinsics, PosedCamera
 from nerg_mi.train.radiance_data import FreeSpace
-from nerg_mi.train.radiance_grid import DensityGrid, OccupancyExtraction
+from nerg_mi.train.radiance_grid import MarchGrid, OccupancyExtraction
 
 # ---- Density grid ----
 #
@@ -66,7 +66,7 @@ def test_cells_that_enough_cameras_see_are_sampled():
         d = p - camera.center
         seen.append((d[..., 2] < 0) & (np.abs(d[..., :2]) < -1.1 * d[..., 2:]).all(axis=-1))
     for minimum in (1, 2, 3, 9):
-        grid = DensityGrid(ns, BOX, R, 0.1, cameras, minimum)
+        grid = MarchGrid(ns, BOX, R, 0.1, cameras, minimum)
         want = np.sum(seen, axis=0) >= min(minimum, 3)
         assert np.array_equal(cube(grid.seen), want) and grid.seen_count == want.sum()
         assert 0 < want.sum() < R**3
@@ -74,10 +74,10 @@ def test_cells_that_enough_cameras_see_are_sampled():
 
 def test_cells_near_a_camera_are_not_sampled():
     near = 0.9
-    grid = DensityGrid(
+    grid = MarchGrid(
         ns, BOX, R, 0.1, [camera_at(0, 0, 1.5)], 1, free_space=FreeSpace(*np.full((2, 1), near, np.float32))
     )
-    free = DensityGrid(ns, BOX, R, 0.1, [camera_at(0, 0, 1.5)], 1)
+    free = MarchGrid(ns, BOX, R, 0.1, [camera_at(0, 0, 1.5)], 1)
     far = np.linalg.norm(centres() - [0, 0, 1.5], axis=-1) > near
     assert np.array_equal(cube(grid.seen), cube(free.seen) & far) and (cube(free.seen) & ~far).any()
 
@@ -85,18 +85,18 @@ def test_cells_near_a_camera_are_not_sampled():
 def test_free_space_in_view_of_a_camera_is_not_sampled():
     cameras = [camera_at(0, 0, 0.5), camera_at(0, 0, 30)]
     free_space = FreeSpace(np.float32([0.1, 0.1]), np.float32([0.8, 0.1]))
-    seen = cube(DensityGrid(ns, BOX, R, 0.1, cameras, 1, free_space=free_space).seen)
+    seen = cube(MarchGrid(ns, BOX, R, 0.1, cameras, 1, free_space=free_space).seen)
     d = centres() - [0, 0, 0.5]
     is_in_view = np.abs(d[..., :2]).max(axis=-1) < -0.95 * d[..., 2]
     near = np.linalg.norm(d, axis=-1) < 0.8
     assert not seen[is_in_view & near].any() and seen[~is_in_view & near].any()
-    everything = cube(DensityGrid(ns, BOX, R, 0.1, cameras, 1).seen)
+    everything = cube(MarchGrid(ns, BOX, R, 0.1, cameras, 1).seen)
     assert np.array_equal(seen[~(is_in_view & near)], everything[~(is_in_view & near)])
 
 
 def test_space_that_is_no_longer_empty_is_sampled_where_density_is():
     camera = camera_at(0, 0, 1.5)
-    grid = DensityGrid(ns, BOX, R, 0.1, [camera], 1, free_space=FreeSpace.within(1, 0.9))
+    grid = MarchGrid(ns, BOX, R, 0.1, [camera], 1, free_space=FreeSpace.within(1, 0.9))
 
     def left_half(p, active):
         return dr.select(p.x < 0, ns.Float(1e3), 0)
@@ -104,7 +104,7 @@ def test_space_that_is_no_longer_empty_is_sampled_where_density_is():
     grid.update(left_half, rng(), everywhere=True)
     before, bits = cube(grid.seen), cube(grid.bits)
     grid.set_free_space(FreeSpace.within(1, 0))
-    reference = DensityGrid(ns, BOX, R, 0.1, [camera], 1)
+    reference = MarchGrid(ns, BOX, R, 0.1, [camera], 1)
     assert np.array_equal(cube(grid.seen), cube(reference.seen)) and grid.seen_count == reference.seen_count
     assert np.array_equal(cube(grid.bits), bits)
     for _ in range(8):
@@ -117,12 +117,12 @@ def test_space_that_is_no_longer_empty_is_sampled_where_density_is():
 def test_cells_outside_a_non_cubic_box_are_empty():
     """The grid spans a cube; cells with centres more than half a cell outside the box are empty."""
     for z, rows in ((0.3, [2, 3, 4, 5]), (0.2, [3, 4])):
-        grid = DensityGrid(ns, Box((-1, -1, -z), (1, 1, z)), R, 0.1, above(), 1)
+        grid = MarchGrid(ns, Box((-1, -1, -z), (1, 1, z)), R, 0.1, above(), 1)
         assert np.unique(np.nonzero(cube(grid.seen))[0]).tolist() == rows
 
 
 def test_points_map_to_their_cells():
-    grid = DensityGrid(ns, BOX, R, 0.1, above(), 1)
+    grid = MarchGrid(ns, BOX, R, 0.1, above(), 1)
     marked = rng().random((R, R, R)) < 0.3
     grid.bits = ns.UInt8(marked.ravel())
     p = rng().uniform(-1, 1, (500, 3))
@@ -134,7 +134,7 @@ def test_points_map_to_their_cells():
 
 
 def test_surface_points_keep_their_cells_and_the_neighbours():
-    grid = DensityGrid(ns, BOX, R, 0.1, above(), 1)
+    grid = MarchGrid(ns, BOX, R, 0.1, above(), 1)
     points = np.array([[0.6, 0.1, -0.9], [-0.99, 0.99, 0.3]])
     grid.carve([ns.Array3f(*map(float, p)) for p in points])
     held = np.zeros((R, R, R), bool)
@@ -147,7 +147,7 @@ def test_surface_points_keep_their_cells_and_the_neighbours():
 
 
 def test_an_update_turns_cells_on_where_density_is_and_off_where_it_was():
-    grid = DensityGrid(ns, BOX, R, 0.1, above(), 1, threshold=0.01)
+    grid = MarchGrid(ns, BOX, R, 0.1, above(), 1, threshold=0.01)
     left = cube(np.arange(R**3) % R < 2)  # x < -0.5
     position = lambda p, active: dr.select(p.x < -0.5, ns.Float(5.0), 0.0)
     grid.update(position, rng(), everywhere=True)
@@ -166,7 +166,7 @@ def test_an_update_turns_cells_on_where_density_is_and_off_where_it_was():
 
 
 def test_optical_depth_of_a_cell_is_bounded():
-    grid = DensityGrid(ns, BOX, R, 0.1, above(), 1)
+    grid = MarchGrid(ns, BOX, R, 0.1, above(), 1)
     grid.update(around((0, 0, 0), 9, gain=1e9), rng(), everywhere=True)
     assert np.array_equal(grid.value.numpy(), np.full(R**3, 10, np.float32))
 
@@ -176,7 +176,7 @@ def test_threshold_of_a_thin_field_is_half_its_mean(thick):
     """Slabs of x of optical depth 1, 0.3, 0.05 and 0 times ``thick``: cells above half of the mean are occupied, and
     all above the threshold.
     """
-    grid = DensityGrid(ns, BOX, R, 1.0, above(), 1, threshold=0.3)
+    grid = MarchGrid(ns, BOX, R, 1.0, above(), 1, threshold=0.3)
     shares = np.array([1, 0.3, 0.05, 0])
 
     def density(p, active):
@@ -190,7 +190,7 @@ def test_threshold_of_a_thin_field_is_half_its_mean(thick):
 
 
 def test_points_in_unsampled_cells():
-    grid = DensityGrid(ns, BOX, R, 0.1, above(), 1)
+    grid = MarchGrid(ns, BOX, R, 0.1, above(), 1)
     grid.update(lambda p, active: dr.select(p.x < -0.5, ns.Float(5.0), 0.0), rng(), everywhere=True)
     p = np.array(grid.empty_points(4000, rng()))
     assert p.shape == (3, 4000) and (p[0] >= -0.5).all() and (np.abs(p) <= 1).all()
@@ -209,7 +209,7 @@ def everything(density, occupied):
 
 
 def test_occupancy_includes_neighbours_of_dense_cells():
-    grid = DensityGrid(ns, BOX, R, 0.1, above(), 1)
+    grid = MarchGrid(ns, BOX, R, 0.1, above(), 1)
     point = centres()[3, 4, 2]
     bound = grid.extract_occupancy(around(point, 0.1), rng(), everything)
     held = np.zeros((R, R, R), bool)
@@ -218,7 +218,7 @@ def test_occupancy_includes_neighbours_of_dense_cells():
 
 
 def test_occupancy_excludes_cells_that_do_not_contribute():
-    grid = DensityGrid(ns, BOX, R, 0.1, above(), 1)
+    grid = MarchGrid(ns, BOX, R, 0.1, above(), 1)
     fog = around((0, 0, 0), 9)
     calls = []
 
@@ -234,7 +234,7 @@ def test_occupancy_excludes_cells_that_do_not_contribute():
 
 def test_occupancy_detects_density_in_a_small_part_of_a_cell():
     """One of three strata per axis: a corner that a single point in the cell would usually miss."""
-    grid = DensityGrid(ns, BOX, R, 0.1, above(), 1)
+    grid = MarchGrid(ns, BOX, R, 0.1, above(), 1)
     corner = centres()[3, 4, 2] + 1 / R
     inside = lambda p, active: dr.select(
         (p.x > corner[0] - 0.25 / 3)
@@ -255,11 +255,11 @@ def test_occupancy_detects_density_in_a_small_part_of_a_cell():
 def test_cells_and_steps_of_a_contracted_box_grow_outwards():
     """The inner cube, 2 units wide, has half of the cells along each edge."""
     box = ContractedBox(BOX, 16)
-    grid = DensityGrid(ns, box, R, 0.01, above(), 1, growth=1 / 128)
+    grid = MarchGrid(ns, box, R, 0.01, above(), 1, growth=1 / 128)
     p = ns.Array3f([0.5, 0.0, 4.0], [0.0, -0.9, 0.0], [0.0, 0.2, 3.0])
     assert np.allclose(grid.cell_size_at(p).numpy(), np.array([1, 1, 4]) * 2 / (R / 2))
     assert np.allclose(grid.step_length_at(p).numpy(), [0.01, 0.01, 5 / 128])
-    plain = DensityGrid(ns, BOX, R, 0.01, above(), 1, growth=1 / 128)
+    plain = MarchGrid(ns, BOX, R, 0.01, above(), 1, growth=1 / 128)
     assert plain.cell_size_at(p) == 2 / R and plain.step_length_at(p) == pytest.approx(0.01)
 
 
@@ -286,7 +286,7 @@ def everywhere(density, occupied, rng):
 
 
 def test_contributing_cells_and_neighbours_stay_sampled():
-    grid = DensityGrid(ns, BOX, R, 0.1, above(), 1)
+    grid = MarchGrid(ns, BOX, R, 0.1, above(), 1)
     settle(grid, around(centres()[3, 4, 2], 0.1), everywhere)
     grid.update(empty, np.random.default_rng(0), everywhere=True)
     held = np.zeros((R, R, R), bool)
@@ -297,20 +297,20 @@ def test_contributing_cells_and_neighbours_stay_sampled():
 
 
 def test_cells_that_do_not_contribute_are_excluded():
-    grid = DensityGrid(ns, BOX, R, 0.1, above(), 1)
+    grid = MarchGrid(ns, BOX, R, 0.1, above(), 1)
     one = ns.Array3f(*map(float, centres()[5, 1, 6]))
     settle(grid, around((0, 0, 0), 9), lambda density, occupied, rng: one)
     grid.update(empty, np.random.default_rng(0), everywhere=True)
     lit = np.zeros((R, R, R), bool)
     lit[5, 1, 6] = True
     assert np.array_equal(cube(grid.bits) > 0, grown(lit))
-    none = DensityGrid(ns, BOX, R, 0.1, above(), 1)
+    none = MarchGrid(ns, BOX, R, 0.1, above(), 1)
     settle(none, around((0, 0, 0), 9), lambda density, occupied, rng: None)
     assert not none.always.numpy().any()
 
 
 def test_each_piece_evaluates_one_part_of_the_cells():
-    grid, calls = DensityGrid(ns, BOX, R, 0.1, above(), 1), []
+    grid, calls = MarchGrid(ns, BOX, R, 0.1, above(), 1), []
 
     def density(p, active):
         calls.append(dr.width(p))
@@ -326,14 +326,14 @@ def test_extraction_resumes_from_a_stored_state():
     lit = lambda density, occupied, rng: ns.Array3f(
         *[ns.Float(x) for x in rng.uniform(-1, 1, (3, 2)).astype(np.float32)]
     )
-    density, full, resumed = around((0.2, 0.1, 0), 0.6), *(DensityGrid(ns, BOX, R, 0.1, above(), 1) for _ in range(2))
+    density, full, resumed = around((0.2, 0.1, 0), 0.6), *(MarchGrid(ns, BOX, R, 0.1, above(), 1) for _ in range(2))
     settle(full, density, lit)
     for stop in (5, 40):
-        first, second = OccupancyExtraction(DensityGrid(ns, BOX, R, 0.1, above(), 1)), OccupancyExtraction(resumed)
+        first, second = OccupancyExtraction(MarchGrid(ns, BOX, R, 0.1, above(), 1)), OccupancyExtraction(resumed)
         while first.pieces_done < stop:
             first.advance(density, lit, 0)
         second.restore(first.pieces_done, first.dense_cells.numpy(), first.contributing_cells.numpy())
         settle(resumed, density, lit, second)
         assert np.array_equal(full.always.numpy(), resumed.always.numpy())
-        resumed = DensityGrid(ns, BOX, R, 0.1, above(), 1)
+        resumed = MarchGrid(ns, BOX, R, 0.1, above(), 1)
     assert full.always.numpy().any() and not full.always.numpy().all()

@@ -8,7 +8,8 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.fields.radiance import RadianceField
+from nerg_mi.fields.mlp import stack, unstack
+from nerg_mi.fields.radiance import RadianceNetwork
 from nerg_mi.train.radiance_losses import (
     PHOTO_PARAMETER,
     PhotoColors,
@@ -19,9 +20,7 @@ from nerg_mi.train.radiance_losses import (
     evaluate_samples,
     huber_loss,
     make_density_prepass,
-    stack,
     surface_loss,
-    unstack,
 )
 from nerg_mi.train.radiance_sampling import RaySamples, Segments
 from nerg_mi.train.radiance_trainer import RadianceTrainer
@@ -105,7 +104,7 @@ def test_huber_is_smooth_where_its_pieces_meet():
 
 
 def field():
-    out, rng = RadianceField.random(TINY, BOX, ns, 0), np.random.default_rng(1)
+    out, rng = RadianceNetwork.random(TINY, BOX, ns, 0), np.random.default_rng(1)
     out.set_parameters({"grid.table": ns.Float(rng.normal(size=len(out.grid.table)).astype(np.float32))})
     return out
 
@@ -159,7 +158,7 @@ def test_rows_are_stacked_and_taken_apart():
 
 def test_tensor_products_equal_the_fields_own_evaluation():
     rng = np.random.default_rng(2)
-    field = RadianceField.random(TINY, BOX, ns, 0)
+    field = RadianceNetwork.random(TINY, BOX, ns, 0)
     field.set_parameters({"grid.table": ns.Float(rng.normal(size=len(field.grid.table)).astype(np.float32))})
     p = ns.Array3f(rng.uniform(-0.99, 0.99, (3, 200)).astype(np.float32))
     d = dr.normalize(ns.Array3f(rng.normal(size=(3, 200)).astype(np.float32)))
@@ -171,7 +170,7 @@ def test_tensor_products_equal_the_fields_own_evaluation():
 
 def test_a_deferred_field_composites_features_and_colours_rays():
     config, (p, d) = replace(TINY, deferred=True), points()
-    made = RadianceField.random(config, BOX, ns, 0)
+    made = RadianceNetwork.random(config, BOX, ns, 0)
     sigma, parts = evaluate_samples(config, BOX, made.parameters(), p, d, ns)
     expected, features = made.density_features(p)
     assert np.allclose(sigma.numpy(), expected.numpy(), rtol=1e-4) and len(parts) == TINY.geometry

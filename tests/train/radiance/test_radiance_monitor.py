@@ -192,7 +192,7 @@ def test_the_figure_has_both_curves_and_the_written_state():
     lines = {line.get_label(): line for line in axes.lines}
     np.testing.assert_array_equal(lines["held-out views"].get_ydata(), [13, 18, 17])
     np.testing.assert_array_equal(lines["training views"].get_ydata(), [13.5, np.nan, 20])
-    marked = lines["written state: step 90, 18.00 dB on held-out views"]
+    marked = lines["written state: step 90, 18.00 dB on these held-out views"]
     assert marked.get_xydata().tolist() == [[8, 18]]
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("training time [s]", "PSNR [dB]")
     assert sorted(int(t.get_text()) for t in top.get_xticklabels()) == [50, 90, 120]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.fields.encoding import HashGridConfig
-from nerg_mi.fields.radiance import RadianceConfig, RadianceField
+from nerg_mi.fields.radiance import RadianceConfig, RadianceNetwork
 from nerg_mi.maths.geometry import Box, ContractedBox
 from nerg_mi.photos.cameras import Intrinsics, PosedCamera, pixel_directions
 from nerg_mi.photos.dataset import depth_points
@@ -153,7 +153,7 @@ def test_result_is_the_average_of_every_fourth_step(dataset, average):
 def test_gradient_of_the_whole_loss_agrees_with_finite_differences(dataset, config):
     """Fixed samples, all loss terms, a direction through all weights: central differences to 1 %."""
     rng = np.random.default_rng(6)
-    field = RadianceField.random(config, BOX, ns, 0)
+    field = RadianceNetwork.random(config, BOX, ns, 0)
     table = rng.normal(size=len(field.grid.table)).astype(np.float32)
     field.set_parameters({"grid.table": ns.Float(table)})
     pixels = PixelBank(ns, dataset.train).gather_batch(ns.UInt32(rng.integers(0, 24 * 24, 64).astype(np.uint32)))

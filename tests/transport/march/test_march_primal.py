@@ -11,7 +11,7 @@ import pytest
 
 from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.occupancy import OccupancyGrid
-from nerg_mi.fields.radiance import RadianceConfig, RadianceField
+from nerg_mi.fields.radiance import RadianceConfig, RadianceNetwork
 from nerg_mi.maths.geometry import Box
 from nerg_mi.transport.depth import find_surface_depth, penetration_depth
 from nerg_mi.transport.field_medium import FieldMedium
@@ -438,7 +438,7 @@ def field_with(bits, seed=0, gain=1.0):
     )
     out = []
     for occupancy in (OccupancyGrid(bits, ns, 0.01), None):
-        f = RadianceField.random(config, Box((0, 0, 0), (1, 1, 1)), ns, seed, occupancy=occupancy)
+        f = RadianceNetwork.random(config, Box((0, 0, 0), (1, 1, 1)), ns, seed, occupancy=occupancy)
         rng = np.random.default_rng(seed)
         f.set_parameters({"grid.table": ns.Float((gain * rng.normal(size=len(f.grid.table))).astype(np.float32))})
         out.append(FieldMedium(f))

@@ -1,0 +1,422 @@
+"""Visits (dwells) of gaze samples, and their sums per participant, cell and area."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from nerg_mi.tracking.filters import group_by_person
+from nerg_mi.tracking.rays import Rays
+
+from .placed import HitAssignment
+from .settings import VisitRules
+
+# ---- Visits ----
+#
+# A *session* is a run of a participant's samples without a pause longer than `VisitRules.session_gap`. A sample
+# represents the time to the next sample of its session. If that time exceeds `VisitRules.max_gap`, and at the end of a
+# session, a sample represents the median step of the session (over the steps that do not exceed the gap), or zero if
+# there is no such step. A *visit* of an area is a run of samples that hit it, interrupted by nothing longer than
+# `VisitRules.merge_gap`. Runs shorter than `VisitRules.min_visit`, from the start of the first sample to the end of the
+# last one, are discarded.
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """N samples sorted by participant and time: ``person`` (N,) indices, ``t`` (N,) seconds, ``weight`` (N,) the
+    represented time, ``session`` (N,) numbers from 0."""
+
+    person: np.ndarray
+    t: np.ndarray
+    weight: np.ndarray
+    session: np.ndarray
+
+
+def make_timeline(person: np.ndarray, t: np.ndarray, rules: VisitRules) -> Timeline:
+    """Compute sessions and represented times of samples that are sorted by participant and time.
+
+    Raises ``ValueError`` for unsorted samples and for times that are not finite.
+    """
+    if not np.isfinite(t).all():
+        raise ValueError("times must be finite")
+    step = np.diff(t)
+    same_person = np.diff(person) == 0
+    if np.any(np.diff(person) < 0) or np.any(step[same_person] < 0):
+        raise ValueError("samples must be sorted by participant and time")
+    # A relative tolerance for times that were stored in single precision.
+    is_continued = same_person & (step <= rules.session_gap * (1 + 1e-9))
+    session = np.cumsum(np.r_[np.zeros(min(len(t), 1), int), ~is_continued])
+    is_within_gap = is_continued & (step <= rules.max_gap * (1 + 1e-9))
+    median_step = _session_medians(
+        session[:-1][is_within_gap & (step > 0)],
+        step[is_within_gap & (step > 0)],
+        int(session[-1]) + 1 if len(t) else 0,
+    )
+    weight = median_step[session] if len(t) else np.zeros(0)
+    weight[:-1][is_within_gap] = step[is_within_gap]
+    return Timeline(person, t, weight, session)
+
+
+def _session_medians(session: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
+    """Return the median of the ``values`` in each of ``count`` sessions, 0 for sessions without values."""
+    medians = np.zeros(count)
+    order = np.lexsort((values, session))
+    number = np.bincount(session, minlength=count)
+    start = np.cumsum(number) - number
+    is_present = number > 0
+    low, high = start[is_present] + (number[is_present] - 1) // 2, start[is_present] + number[is_present] // 2
+    medians[is_present] = (values[order[low]] + values[order[high]]) / 2
+    return medians
+
+
+@dataclass(frozen=True)
+class Visits:
+    """L visits of one area, sorted by participant and time: the row of the first sample, the start and the end in
+    seconds, (L,) each."""
+
+    first: np.ndarray
+    start: np.ndarray
+    end: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+    @property
+    def duration(self) -> np.ndarray:
+        return self.end - self.start
+
+
+def _measure_rounding(t: np.ndarray) -> np.ndarray:
+    """Return a bound on the error of differences of times ``t`` in seconds, which may count from 1970."""
+    return 1e-9 + 4 * np.spacing(np.abs(t))
+
+
+def find_visits(rows: np.ndarray, timeline: Timeline, rules: VisitRules) -> Visits:
+    """Return the visits formed by the sorted ``rows`` of a timeline."""
+    if not len(rows):
+        return Visits(np.zeros(0, np.int64), np.zeros(0), np.zeros(0))
+    start, end = timeline.t[rows], timeline.t[rows] + timeline.weight[rows]
+    # Compare with the end of the previous sample.
+    is_gap = start[1:] - end[:-1] > rules.merge_gap + _measure_rounding(start[1:])
+    is_start = np.r_[True, is_gap | (np.diff(timeline.session[rows]) != 0)]
+    first = np.flatnonzero(is_start)
+    last = np.r_[first[1:], len(rows)] - 1
+    duration = end[last] - start[first]
+    is_visit = duration >= rules.min_visit - _measure_rounding(end[last])
+    return Visits(rows[first][is_visit], start[first][is_visit], end[last][is_visit])
+
+
+# ---- Sums ----
+#
+# Sums per participant, cell and area, which can be added up in any partition of the data.
+#
+# A *cell* is a subset of the data that is analysed separately: all samples, a cohort, a time window, or a zone of the
+# floor. A sample may belong to several cells. `sum_visits` accepts any block of samples that contains whole sessions,
+# in any order; `merge_sums` adds such sums. Added in the same order, they are bitwise equal for every partition of the
+# data. Memory is proportional to participants x cells x areas, and does not depend on the number of samples.
+
+BINS = np.array([0.0, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0, 60.0, np.inf])
+"""Bin edges of the histogram of visit durations, in seconds."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A subset of the data: a ``dimension`` ("all", "cohort", "window" or "zone") and its ``value``."""
+
+    dimension: str
+    value: str
+
+
+ALL = Cell("all", "")
+
+
+@dataclass
+class VisitSums:
+    """Sums of R rows, each of one participant in one cell, and A areas; times are in seconds, distances in metres.
+
+    Parameters
+    ----------
+    areas
+        Names of the areas.
+    cells
+        The C cells.
+    rows
+        Cell and participant of each row.
+    time, squared_time
+        Sums of the represented times and of their squares, (R,).
+    rays, sessions
+        Numbers of samples and of sessions, (R,).
+    dwell_time, hit_rays
+        Represented time and number of the samples that hit the area, (R, A).
+    distance
+        Sum of represented time times hit distance, (R, A).
+    visits
+        Number of visits, (R, A).
+    visible_time
+        Represented time during which the area is visible, (R, A).
+    first_visit_sum, first_visit_count
+        Over sessions with a visit, the time from the first sample of the session in the cell to the first visit, and
+        the number of these sessions, (R, A).
+    first_start, last_end
+        Start of the first visit and end of the last one, (R, A).
+    duration_counts
+        Histogram of visit durations over `BINS`, (C, A, bins).
+    transitions
+        Numbers of transitions from a visit of one area to the next visit of another one, (C, A, A).
+    """
+
+    areas: tuple[str, ...]
+    cells: tuple[Cell, ...]
+    rows: tuple[tuple[Cell, str], ...]
+    time: np.ndarray
+    squared_time: np.ndarray
+    rays: np.ndarray
+    sessions: np.ndarray
+    dwell_time: np.ndarray
+    hit_rays: np.ndarray
+    distance: np.ndarray
+    visits: np.ndarray
+    visible_time: np.ndarray
+    first_visit_sum: np.ndarray
+    first_visit_count: np.ndarray
+    first_start: np.ndarray
+    last_end: np.ndarray
+    duration_counts: np.ndarray
+    transitions: np.ndarray
+
+    @classmethod
+    def empty(cls, areas: Sequence[str], cells: Sequence[Cell], rows: Sequence[tuple[Cell, str]] = ()) -> VisitSums:
+        """Return zero sums with the given ``rows``."""
+        R, A, C = len(rows), len(areas), len(cells)
+        arrays = {name: np.zeros(R) for name in _PER_ROW} | {name: np.zeros((R, A)) for name in _PER_AREA}
+        arrays["first_start"] += np.inf
+        arrays["last_end"] -= np.inf
+        counts, transitions = np.zeros((C, A, len(BINS) - 1)), np.zeros((C, A, A))
+        return cls(tuple(areas), tuple(cells), tuple(rows), **arrays, duration_counts=counts, transitions=transitions)
+
+    def find_participants(self, cell: Cell) -> tuple[np.ndarray, list[str]]:
+        """Return the rows of a cell and the names of their participants, sorted by name."""
+        rows = sorted((person, r) for r, (row_cell, person) in enumerate(self.rows) if row_cell == cell)
+        return np.array([r for _, r in rows], np.int64), [person for person, _ in rows]
+
+
+_PER_ROW = ("time", "squared_time", "rays", "sessions")
+_PER_AREA = (
+    "dwell_time",
+    "hit_rays",
+    "distance",
+    "visits",
+    "visible_time",
+    "first_visit_sum",
+    "first_visit_count",
+    "first_start",
+    "last_end",
+)
+_MINIMUM, _MAXIMUM = ("first_start",), ("last_end",)
+
+
+class Total:
+    """Running total of `VisitSums`."""
+
+    def __init__(self, areas: Sequence[str], cells: Sequence[Cell]):
+        self._areas, self._cells = tuple(areas), tuple(cells)
+        self._row_of: dict[tuple[Cell, str], int] = {}
+        # Grows geometrically, so that adding takes amortised time proportional to what is added.
+        self._buffer = VisitSums.empty(areas, cells)
+        self._capacity = 0
+
+    def add(self, part: VisitSums) -> None:
+        """Add ``part``. Raises ``ValueError`` if its areas or cells differ."""
+        if (part.areas, part.cells) != (self._areas, self._cells):
+            raise ValueError("sums with different areas or cells cannot be added")
+        for row in part.rows:
+            self._row_of.setdefault(row, len(self._row_of))
+        if len(self._row_of) > self._capacity:
+            self._grow(max(2 * self._capacity, len(self._row_of)))
+        rows = np.array([self._row_of[row] for row in part.rows], np.int64)
+        for name in (*_PER_ROW, *_PER_AREA):
+            out = getattr(self._buffer, name)
+            add = np.minimum if name in _MINIMUM else np.maximum if name in _MAXIMUM else np.add
+            out[rows] = add(out[rows], getattr(part, name))
+        self._buffer.duration_counts += part.duration_counts
+        self._buffer.transitions += part.transitions
+
+    def _grow(self, capacity: int) -> None:
+        new, old = VisitSums.empty(self._areas, self._cells, [(ALL, "")] * capacity), self._buffer
+        for name in (*_PER_ROW, *_PER_AREA):
+            getattr(new, name)[: self._capacity] = getattr(old, name)
+        new.duration_counts, new.transitions = old.duration_counts, old.transitions
+        self._buffer, self._capacity = new, capacity
+
+    def sums(self) -> VisitSums:
+        """Return a view of the total so far."""
+        n = len(self._row_of)
+        arrays = {name: getattr(self._buffer, name)[:n] for name in (*_PER_ROW, *_PER_AREA)}
+        other_arrays = dict(duration_counts=self._buffer.duration_counts, transitions=self._buffer.transitions)
+        return VisitSums(self._areas, self._cells, tuple(self._row_of), **arrays, **other_arrays)
+
+
+def merge_sums(sums: Iterable[VisitSums]) -> VisitSums:
+    """Add one or more sums in the given order. Raises ``ValueError`` if areas or cells differ."""
+    total: Total | None = None
+    for part in sums:
+        total = total or Total(part.areas, part.cells)
+        total.add(part)
+    if total is None:
+        raise ValueError("at least one sum is needed")
+    return total.sums()
+
+
+def sum_visits(
+    rays: Rays,
+    hits: HitAssignment,
+    areas: Sequence[str],
+    cells: Sequence[tuple[Cell, np.ndarray | None]],
+    rules: VisitRules,
+    visibility: np.ndarray | None = None,
+    transition_areas: Sequence[int] | None = None,
+) -> VisitSums:
+    """Sum the visits of a block of N samples that contains whole sessions.
+
+    Parameters
+    ----------
+    rays
+        Gaze samples in any order.
+    hits
+        Hits on ``areas``, by row of ``rays``.
+    areas
+        Names of the areas.
+    cells
+        Cells with a mask (N,) of their samples, or None for all samples.
+    rules
+        Definition of sessions and visits.
+    visibility
+        Whether each area is visible for each sample, (N, A); None if unknown. An area that is hit counts as visible.
+    transition_areas
+        Indices of the areas between which transitions are counted. Default: all.
+    """
+    order, _ = group_by_person(rays)
+    timeline = make_timeline(rays.person[order], rays.t[order], rules)
+    position = np.empty(len(order), np.int64)
+    position[order] = np.arange(len(order))
+    masks = [None if mask is None else mask[order] for _, mask in cells]
+    keys, starts = [], []
+    present = []
+    for (cell, _), mask in zip(cells, masks):
+        codes = np.unique(timeline.person if mask is None else timeline.person[mask])
+        starts.append(len(keys))
+        present.append(codes)
+        keys += [(cell, rays.persons[code]) for code in codes]
+    out = VisitSums.empty(areas, [cell for cell, _ in cells], keys)
+    # For each cell, the row of each participant, or -1.
+    tables = []
+    for codes, start in zip(present, starts):
+        table = np.full(len(rays.persons), -1, np.int64)
+        table[codes] = start + np.arange(len(codes))
+        tables.append(table)
+    session_starts = [_add_rows(out, timeline, mask, table) for mask, table in zip(masks, tables)]
+    visits_of_areas = []
+    for a, (rows, distance) in enumerate(zip(hits.rows, hits.distance)):
+        hit_rows = position[rows]
+        by_row = np.argsort(hit_rows, kind="stable")
+        hit_rows, hit_distance = hit_rows[by_row], distance[by_row]
+        is_visible = None
+        if visibility is not None:
+            is_visible = visibility[order, a].copy()
+            is_visible[hit_rows] = True
+        visits = find_visits(hit_rows, timeline, rules)
+        visits_of_areas.append(visits)
+        for c, (mask, table) in enumerate(zip(masks, tables)):
+            _add_area(out, a, timeline, mask, table, hit_rows, hit_distance, is_visible)
+            subset = slice(None) if mask is None else mask[visits.first]
+            first, start, end = visits.first[subset], visits.start[subset], visits.end[subset]
+            # Visits of whole sampling intervals may last exactly as long as a bin's edge.
+            out.duration_counts[c, a] += np.histogram(end - start + _measure_rounding(end), BINS)[0]
+            _add_visits(out, a, timeline, table, session_starts[c], first, start, end)
+    _add_transitions(
+        out, timeline, masks, visits_of_areas, range(len(areas)) if transition_areas is None else transition_areas
+    )
+    return out
+
+
+def _sum_into(out: np.ndarray, rows: np.ndarray, values: np.ndarray | float = 1.0) -> None:
+    if len(rows):
+        weights = np.broadcast_to(np.asarray(values, float), rows.shape)
+        out += np.bincount(rows, weights=weights, minlength=len(out))
+
+
+def _add_rows(out: VisitSums, timeline: Timeline, mask: np.ndarray | None, table: np.ndarray) -> np.ndarray:
+    """Add the sums that do not depend on areas, and return the start of each session in the cell, infinite if it has
+    no sample there."""
+    row = table[timeline.person] if mask is None else table[timeline.person[mask]]
+    weight, t, session = (v if mask is None else v[mask] for v in (timeline.weight, timeline.t, timeline.session))
+    _sum_into(out.time, row, weight)
+    _sum_into(out.squared_time, row, weight**2)
+    _sum_into(out.rays, row)
+    session_start = np.full(int(timeline.session[-1]) + 1 if len(timeline.t) else 0, np.inf)
+    numbers, first = np.unique(session, return_index=True)
+    session_start[numbers] = t[first]
+    _sum_into(out.sessions, row[first])
+    return session_start
+
+
+def _add_area(
+    out: VisitSums,
+    a: int,
+    timeline: Timeline,
+    mask: np.ndarray | None,
+    table: np.ndarray,
+    hit_rows: np.ndarray,
+    distance: np.ndarray,
+    is_visible: np.ndarray | None,
+) -> None:
+    subset = slice(None) if mask is None else mask[hit_rows]
+    hit_rows, distance = hit_rows[subset], distance[subset]
+    row, weight = table[timeline.person[hit_rows]], timeline.weight[hit_rows]
+    _sum_into(out.dwell_time[:, a], row, weight)
+    _sum_into(out.hit_rays[:, a], row)
+    _sum_into(out.distance[:, a], row, weight * distance)
+    if is_visible is not None:
+        visible_rows = np.flatnonzero(is_visible if mask is None else is_visible & mask)
+        _sum_into(out.visible_time[:, a], table[timeline.person[visible_rows]], timeline.weight[visible_rows])
+
+
+def _add_visits(
+    out: VisitSums,
+    a: int,
+    timeline: Timeline,
+    table: np.ndarray,
+    session_start: np.ndarray,
+    first: np.ndarray,
+    start: np.ndarray,
+    end: np.ndarray,
+) -> None:
+    row = table[timeline.person[first]]
+    _sum_into(out.visits[:, a], row)
+    np.minimum.at(out.first_start[:, a], row, start)
+    np.maximum.at(out.last_end[:, a], row, end)
+    session, index = np.unique(timeline.session[first], return_index=True)
+    _sum_into(out.first_visit_sum[:, a], row[index], start[index] - session_start[session])
+    _sum_into(out.first_visit_count[:, a], row[index])
+
+
+def _add_transitions(
+    out: VisitSums, timeline: Timeline, masks: list, visits_of_areas: list, transition_areas: Sequence[int]
+) -> None:
+    if not len(transition_areas):
+        return
+    first = np.concatenate([visits_of_areas[a].first for a in transition_areas])
+    start = np.concatenate([visits_of_areas[a].start for a in transition_areas])
+    area = np.concatenate([np.full(len(visits_of_areas[a]), a) for a in transition_areas])
+    if len(first) < 2:
+        return
+    session = timeline.session[first]
+    order = np.lexsort((area, start, session))
+    first, area, session = first[order], area[order], session[order]
+    is_transition = (np.diff(session) == 0) & (np.diff(area) != 0)
+    for c, mask in enumerate(masks):
+        # A transition belongs to the cell in which it ends.
+        subset = is_transition if mask is None else is_transition & mask[first[1:]]
+        np.add.at(out.transitions[c], (area[:-1][subset], area[1:][subset]), 1)

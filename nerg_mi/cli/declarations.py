@@ -1,0 +1,149 @@
+"""How a command is declared, and the Mitsuba variant that it runs with."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+from nerg_mi.options import OUTPUT, PANEL
+from nerg_mi.threads import set_thread_count
+
+# ---- Backend: the Mitsuba variant and the number of threads ----
+
+
+def select_backend(mode: str | None, threads: int | None = None, *, allow_scalar: bool = False) -> None:
+    """Activate the Mitsuba variant ``mode``.
+
+    ``mode`` None selects the fastest variant that works. ``threads`` is the number of CPU threads; None or 0 uses all
+    cores. Raises `NergError` for a variant that does not exist or does not work, and for scalar variants unless
+    ``allow_scalar``, since fields need Dr.Jit.
+    """
+    from nerg_mi.environment.scene_loading import activate_variant
+    from nerg_mi.fields.mlp import namespace
+
+    active = activate_variant(mode)
+    if threads:
+        set_thread_count(threads)
+    if not allow_scalar:
+        namespace(active)
+
+
+# ---- Commands ----
+#
+# A command is a row of `nerg_mi.cli.table`. One that no function of the library serves is declared where it is defined:
+# the docstring of its module starts with its line, as in "``nerg doctor``: Check the installation", by which it is
+# found without importing the module.
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter of a command that is not a field of its options."""
+
+    help: str
+    # Type of the value: Path, str, list[Path] for several values, ...
+    kind: Any = Path
+    # ... marks a required value.
+    default: Any = ...
+    # Spellings of an option; empty for an argument.
+    names: tuple[str, ...] = ()
+    # Further parameters of typer.Option or typer.Argument, such as ``metavar``.
+    more: Mapping[str, Any] = field(default_factory=dict)
+
+
+def argument(help: str, kind: Any = Path, *, required: bool = True, **more: Any) -> Parameter:
+    """Declare a positional argument; ``kind`` list[...] takes several values."""
+    return Parameter(help, kind, ... if required else None, more=more)
+
+
+def out(help: str, kind: Any = Path, *, default: Any = ...) -> Parameter:
+    """Declare the option ``-o``, ``--output``."""
+    return Parameter(help, kind, default, ("-o", "--output"), {PANEL: OUTPUT})
+
+
+def extra(default: Any, help: str, kind: Any, *names: str, group: str = "", **more: Any) -> Parameter:
+    """Declare an option that is not a field of the command's options."""
+    return Parameter(help, kind, default, names, {**more, PANEL: group})
+
+
+@dataclass(frozen=True)
+class HelpView:
+    """What ``--help`` shows of a command with many options, depending on its other arguments."""
+
+    # Paragraph after the help of the command.
+    text: str = ""
+    # Names of parameters that are not listed.
+    hidden: frozenset[str] = frozenset()
+    # Help texts in place of those of the parameters, by name.
+    helps: Mapping[str, str] = field(default_factory=dict)
+    # Further lists of terms and descriptions, by heading.
+    lists: Mapping[str, Sequence[tuple[str, str]]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command as declared by `command`."""
+
+    name: str
+    run: Callable[..., Any]
+    help: str
+    more: str
+    options: type | None
+    without: tuple[str, ...]
+    parameters: Mapping[str, Parameter]
+    view: Callable[[Sequence[str]], HelpView] | None = None
+
+
+COMMANDS: dict[str, Command] = {}
+"""Commands of all imported modules, by name."""
+
+Run = TypeVar("Run", bound=Callable[..., Any])
+
+
+def command(
+    name: str,
+    help: str = "",
+    /,
+    *,
+    more: str = "",
+    options: type | None = None,
+    without: tuple[str, ...] = (),
+    view: Callable[[Sequence[str]], HelpView] | None = None,
+    **parameters: Parameter,
+) -> Callable[[Run], Run]:
+    """Declare the decorated function as what ``nerg NAME`` runs. The function is not changed.
+
+    The function is called with keyword arguments: the values of ``parameters``, ``options`` if there are any, and
+    ``reporter``.
+
+    Parameters
+    ----------
+    name
+        Words of the command, as "train gaze".
+    help
+        Summary for ``--help``, if it differs from the line in the module docstring.
+    more
+        Further paragraphs for ``--help``.
+    options
+        Dataclass whose fields become options (`nerg_mi.options.option`).
+    without
+        Fields that are not exposed on the command line.
+    view
+        Returns what ``--help`` shows with the arguments of the command line. Default: everything.
+    parameters
+        Arguments and options. The names are those of fields of ``options`` or of parameters of the function.
+    """
+
+    def decorate(run: Run) -> Run:
+        COMMANDS[name] = Command(name, run, help, more, options, without, parameters, view)
+        return run
+
+    return decorate
+
+
+def import_function(function: str) -> Callable[..., Any]:
+    """Import and return the function "MODULE:NAME"."""
+    module, _, name = function.partition(":")
+    return getattr(importlib.import_module(module), name)

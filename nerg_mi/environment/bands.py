@@ -1,0 +1,759 @@
+"""Rendering in bands of rows, which bound the memory, and in strips of samples, which bound the time of a kernel."""
+
+from __future__ import annotations
+
+import functools
+import math
+import re
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from nerg_mi.errors import NergError
+from nerg_mi.fields.gaze_base import GazeNetwork
+from nerg_mi.fields.mlp import set_constant_weights
+from nerg_mi.fields.radiance import RadianceNetwork
+from nerg_mi.maths.types import variant_types
+from nerg_mi.transport.field_medium import FieldMedium
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+
+# ---- Layers: several images of the same rays ----
+
+
+class LayerSource(Protocol):
+    """Replaces the integrator of a scene by several images of the same rays, each with its own AOVs."""
+
+    channel_names: list[list[str]]
+    """Names of the AOV channels of each image."""
+
+    num_channels: int
+    """Number of AOV channels of a single image with all AOVs; samples are accumulated as in that image."""
+
+    def sample(self, scene, sampler, ray, medium, active) -> Iterable[tuple]:
+        """Yield ``(radiance, valid, aovs)`` of each image, as the ``sample`` method of an integrator returns them."""
+        ...
+
+
+class IntegratorLayer:
+    """The image of an integrator, as the only layer."""
+
+    def __init__(self, integrator):
+        self.channel_names, self._integrator = [integrator.aov_names()], integrator
+        self.num_channels = len(self.channel_names[0])
+
+    def sample(self, scene, sampler, ray, medium, active) -> Iterable[tuple]:
+        return [self._integrator.sample(scene, sampler, ray, medium, active)]
+
+
+# ---- Strips of samples ----
+#
+# Interruptions and progress reports take place between strips.
+
+PACKET_SIZE = 64
+"""Number of samples that Dr.Jit can accumulate as one (16 on a CPU, 32 on a GPU); strips start at multiples of it."""
+
+MIN_STRIP_SAMPLES = 1 << 12
+"""Number of samples below which the overhead of a strip exceeds its work."""
+
+STRIP_SECONDS = 0.5
+"""Target time of a strip: strips get shorter above it, and longer below half of it."""
+
+
+class SamplePace:
+    """Chooses the number of samples in a strip from the time of previous strips.
+
+    A strip is a range of the samples of an image that is rendered in one kernel. A sample is one camera ray, so a pixel
+    has ``spp`` samples. Strips are to take between half of `STRIP_SECONDS` and `STRIP_SECONDS`: a strip that takes
+    longer halves the number of samples of the next one, and a shorter one doubles it.
+
+    An object can be used for several images in turn, as long as the Mitsuba variant stays the same: the initial and
+    maximum number of samples depend on it.
+
+    Parameters
+    ----------
+    fixed : int
+        Constant number of samples in a strip, over all its pixels; 0 adapts the number to the time.
+    """
+
+    def __init__(self, fixed: int = 0):
+        import mitsuba as mi
+
+        self._fixed = fixed
+        self._count = fixed or (1 << 20 if str(mi.variant()).startswith("cuda") else 1 << 15)
+        self._max_count = 1 << 24 if str(mi.variant()).startswith("cuda") else 1 << 18
+        self._last_time, self._num_strips = 0.0, 0
+
+    def begin(self) -> None:
+        """Start an image: the time since the previous one is not counted."""
+        self._num_strips = 0
+
+    def iter_strips(self, start: int, stop: int, spp: int) -> Iterator[tuple[int, int]]:
+        """Divide samples into strips.
+
+        Parameters
+        ----------
+        start, stop : int
+            Range of sample indices within the image, in which the samples of a pixel are adjacent. The first strip
+            starts at a multiple of `PACKET_SIZE`, possibly before ``start``.
+        spp : int
+            Samples per pixel.
+
+        Yields
+        ------
+        tuple of int
+            First sample and number of samples of each strip.
+        """
+        # Strips contain whole pixels unless a single pixel exceeds the maximum.
+        unit = math.lcm(PACKET_SIZE, spp)
+        unit = unit if unit <= self._max_count else PACKET_SIZE
+        first = start - start % PACKET_SIZE
+        while first < stop:
+            last = min(max((first + self._count) // unit, first // unit + 1) * unit, stop)
+            yield first, last - first
+            first = last
+
+    def wait(self) -> None:
+        """Wait until the previous strip is finished, and adapt the number of samples."""
+        import drjit as dr
+
+        dr.sync_thread()
+        now = time.perf_counter()
+        # The first call waits for nothing, and the first strip includes compilation.
+        if self._num_strips > 1 and not self._fixed:
+            seconds = now - self._last_time
+            if seconds > STRIP_SECONDS:
+                self._count = max(self._count // 2, MIN_STRIP_SAMPLES)
+            elif seconds < STRIP_SECONDS / 2:
+                self._count = min(self._count * 2, self._max_count)
+        self._last_time, self._num_strips = now, self._num_strips + 1
+
+
+# ---- Random numbers of a range of samples ----
+#
+# Mitsuba's ``independent`` sampler gives each sample of an image its own PCG32 generator. State and stream are derived
+# from the seed and the index of the sample by the Tiny Encryption Algorithm. The random numbers of any range of samples
+# can therefore be computed separately.
+
+
+def get_base_seed(sampler) -> int | None:
+    """Return the ``seed`` of an ``independent`` sampler; None for other samplers and for unknown seeding schemes."""
+    import drjit as dr
+
+    match = re.search(r"base_seed = (\d+)", str(sampler))
+    if sampler.class_name() != "IndependentSampler" or not match:
+        return None
+    base, reference, count = int(match[1]), sampler.clone(), 64
+    reference.seed(7, count)
+    sampler_copy = make_strip_sampler(1, base, 7, 0, count)
+    # If a release of Mitsuba seeds differently, images are rendered undivided and stay correct.
+    return base if dr.all(reference.next_2d() == sampler_copy.next_2d(), axis=None) else None
+
+
+def make_strip_sampler(spp: int, base: int, seed: int, first: int, count: int):
+    """Make a sampler for a range of samples of an image.
+
+    Parameters
+    ----------
+    spp : int
+        Samples per pixel.
+    base : int
+        Seed of the scene's sampler (`base_seed`).
+    seed : int
+        Seed of the rendering.
+    first, count : int
+        First sample and number of samples. Samples are numbered pixel by pixel.
+
+    Notes
+    -----
+    Mitsuba renders at most 2^32 samples at once; samples beyond that use other seeds.
+    """
+    import drjit as dr
+
+    mi = variant_types()
+    number = dr.opaque(mi.UInt64, first) + mi.UInt64(dr.arange(mi.UInt32, count))
+    low = mi.UInt32(number & 0xFFFFFFFF)
+    high = mi.UInt32(number >> 32)
+    key = dr.opaque(mi.UInt32, (base + seed) & 0xFFFFFFFF) + high * 0x9E3779B9
+    state, stream = mi.sample_tea_32(key, low)
+    return _get_sampler_class(mi.variant())(spp, mi.PCG32(initstate=mi.UInt64(state), initseq=mi.UInt64(stream)))
+
+
+@functools.cache
+def _get_sampler_class(variant: str):
+    # Mitsuba's classes depend on the variant.
+    import mitsuba as mi
+
+    class StripSampler(mi.Sampler):
+        def __init__(self, spp, generator):
+            super().__init__(mi.Properties())
+            self.set_sample_count(spp)
+            self.generator = generator
+
+        def next_1d(self, active=True):
+            return self.generator.next_float32(mi.Bool(active))
+
+        def next_2d(self, active=True):
+            x = self.next_1d(active)
+            return mi.Point2f(x, self.next_1d(active))
+
+        def clone(self):
+            return StripSampler(self.sample_count(), type(self.generator)(self.generator))
+
+        def to_string(self):
+            return f"Samples[{self.sample_count()} a pixel, {variant}]"
+
+    return StripSampler
+
+
+# ---- Bands ----
+#
+# An image does not depend on how it is divided. Each sample has the position, the ray and the random numbers that it
+# has in the undivided image, and the samples of a pixel are accumulated in the same groups. With a box filter, the
+# pixels equal those of ``mi.render`` bit by bit, even if a pixel's samples are in two strips. With a wider filter, the
+# samples of the rows around a band are rendered again for it; the sums have another order, and pixels differ by the
+# rounding of single precision.
+
+BYTES_PER_VALUE = 22
+"""Memory of a band per value (channel of a pixel), in bytes.
+
+Four bytes are in the block that accumulates samples, the others in copies on the way to the file.
+"""
+
+
+@runtime_checkable
+class ObserverIntegrator(Protocol):
+    """A Python integrator that renders like `mi.SamplingIntegrator`, within a context of its own."""
+
+    def rendering_from(self, sensor, scene) -> AbstractContextManager:
+        """Return a context manager. Inside it, rays passed to the integrator are camera rays of ``sensor``."""
+        ...
+
+
+@dataclass(frozen=True)
+class Band:
+    """A band of rows of an image.
+
+    Parameters
+    ----------
+    top, rows : int
+        First row and number of rows, in the crop window of the film.
+    film : mi.Film
+        Contains the rows until the next band is requested, possibly followed by empty rows.
+    layer : int
+        Index of the image, if a `LayerSource` renders several.
+    """
+
+    top: int
+    rows: int
+    film: Any
+    layer: int = 0
+
+
+def undividable_reason(scene, sensor) -> str | None:
+    """Return the reason why an image of ``sensor`` can only be rendered undivided; None if it can be divided."""
+    import mitsuba as mi
+
+    from nerg_mi.transport.observer import is_batch
+
+    integrator, film = scene.integrator(), sensor.film()
+    if str(mi.variant()).startswith("scalar") or mi.is_spectral or mi.is_polarized:
+        return f"the variant {mi.variant()}"
+    if not isinstance(integrator, mi.SamplingIntegrator) or isinstance(integrator, mi.CppADIntegrator):
+        return f"the integrator {integrator.class_name()}"
+    if not isinstance(integrator, ObserverIntegrator) and _overrides_render(type(integrator), mi.SamplingIntegrator):
+        return f"the integrator {integrator.class_name()}, which overrides render()"
+    if film.class_name() != "HDRFilm":
+        return f"the film {film.class_name()}"
+    if is_batch(sensor):
+        return "a batch of sensors"
+    if get_base_seed(sensor.sampler()) is None:
+        return f"the sampler {sensor.sampler().class_name()}"
+    return None
+
+
+def _overrides_render(kind: type, base: type) -> bool:
+    """Whether a Python integrator class overrides ``render`` of ``base``."""
+    above = kind.__mro__
+    return any("render" in vars(c) for c in above[: above.index(base)])
+
+
+def fit_rows_to_memory(scene, sensor, memory: float) -> int:
+    """Compute how many rows of a band fit into ``memory`` bytes; at least 1.
+
+    With a filter wider than a pixel, a band has at least eight times the radius of the filter, so that at most a
+    quarter of the samples is rendered twice.
+    """
+    width, height = sensor.film().crop_size()
+    values = 5 + len(scene.integrator().aov_names())
+    return int(min(max(memory // (width * values * BYTES_PER_VALUE), 8 * _filter_radius(sensor.film()), 1), height))
+
+
+def _filter_radius(film) -> int:
+    """Return how many rows beyond their own the samples of ``film`` contribute to."""
+    return 0 if film.rfilter().is_box_filter() else int(film.rfilter().border_size())
+
+
+def render_bands(
+    scene,
+    sensor,
+    *,
+    spp: int = 0,
+    seed: int = 0,
+    rows: int = 0,
+    strip: int = 0,
+    on_strip: Callable[[int, int], None] | None = None,
+    layers: LayerSource | None = None,
+    pace: SamplePace | None = None,
+) -> Iterator[Band]:
+    """Render an image band by band from the top, or undivided if `undividable_reason` gives a reason.
+
+    Parameters
+    ----------
+    scene : mi.Scene
+        The scene.
+    sensor : mi.Sensor
+        The camera.
+    spp : int
+        Samples per pixel; 0 uses the number of the sampler.
+    seed : int
+        Seed of the rendering.
+    rows : int
+        Rows of a band; 0 renders all rows in one band.
+    strip : int
+        Samples of a strip; 0 adapts the number to `STRIP_SECONDS`.
+    on_strip : callable, optional
+        Called after each strip with the number of finished samples and of all samples. It may raise an exception.
+    layers : LayerSource, optional
+        Replaces the integrator of the scene, for images that can be divided. The bands of all layers alternate.
+    pace : SamplePace, optional
+        The pace of previous images.
+
+    Yields
+    ------
+    Band
+        The next band, of each layer in turn.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        An undivided image was interrupted; Mitsuba handles the signal in this case.
+    """
+    if undividable_reason(scene, sensor):
+        yield _render_undivided(scene, sensor, spp, seed, on_strip)
+        return
+    grid = _PixelGrid(sensor.film(), spp or sensor.sampler().sample_count(), rows)
+    integrator = scene.integrator()
+    layers = IntegratorLayer(integrator) if layers is None else layers
+    rendering_context = lambda: (
+        integrator.rendering_from(sensor, scene) if isinstance(integrator, ObserverIntegrator) else nullcontext()
+    )
+    base = get_base_seed(sensor.sampler())
+    pace = pace or SamplePace(strip)
+    pace.begin()
+    done = 0
+    for top in range(0, grid.height, grid.rows):
+        blocks = [grid.make_block(names) for names in layers.channel_names]
+        start, stop = grid.sample_range(top)
+        with rendering_context(), grid.match_accumulation(blocks[0], layers):
+            for first, count in pace.iter_strips(start, stop, grid.spp):
+                positions, active, layer_values = _trace_strip(
+                    scene, sensor, layers, grid, base, seed, top, first, count, start
+                )
+                for block, values in zip(blocks, layer_values):
+                    block.put(positions, values, active)
+                    if len(blocks) > 1:
+                        # One kernel per layer, so that layers of the same kind share a kernel.
+                        _evaluate_block(block)
+                # This strip was traced while the previous one was computed.
+                pace.wait()
+                if on_strip is not None and done:
+                    on_strip(min(done, grid.total), grid.total)
+                for block in blocks:
+                    _evaluate_block(block)
+                done += count
+            pace.wait()
+        if on_strip is not None:
+            on_strip(min(done, grid.total), grid.total)
+        for layer, (names, block) in enumerate(zip(layers.channel_names, blocks)):
+            grid.develop(names, block)
+            yield Band(top, min(grid.rows, grid.height - top), sensor.film(), layer)
+
+
+def _render_undivided(scene, sensor, spp, seed, on_strip) -> Band:
+    import drjit as dr
+    import mitsuba as mi
+
+    mi.render(scene, sensor=sensor, spp=spp, seed=seed)
+    dr.sync_thread()
+    if scene.integrator().should_stop():
+        raise KeyboardInterrupt
+    if on_strip is not None:
+        total = int(np.prod(sensor.film().crop_size())) * (spp or sensor.sampler().sample_count())
+        on_strip(total, total)
+    return Band(0, int(sensor.film().crop_size()[1]), sensor.film())
+
+
+def _evaluate_block(block):
+    import drjit as dr
+
+    dr.eval(block.tensor())
+
+
+def _trace_strip(scene, sensor, layers: LayerSource, grid: _PixelGrid, base, seed, top, first, count, start):
+    """Trace a strip of samples.
+
+    Samples before ``start`` are masked. Follows ``SamplingIntegrator::render_sample`` of Mitsuba 3.9, operation by
+    operation.
+
+    Returns
+    -------
+    tuple
+        Positions in the block of the band at ``top``, the mask, and an iterator over the values in each layer.
+    """
+    import drjit as dr
+
+    mi = variant_types()
+    film, spp = sensor.film(), grid.spp
+    sampler = make_strip_sampler(spp, base, seed, first, count)
+    # Opaque numbers are not compiled into the kernel, so that all strips share it.
+    number = dr.arange(mi.UInt32, count)
+    active = number >= dr.opaque(mi.UInt32, max(start - first, 0))
+    number += dr.opaque(mi.UInt32, first % spp)
+    number = number // dr.opaque(mi.UInt32, spp) + dr.opaque(mi.UInt32, first // spp % grid.width)
+    line = number // grid.width
+    pixel = mi.Vector2i(number - line * grid.width, line + dr.opaque(mi.UInt32, first // spp // grid.width))
+    pixel += mi.Vector2i(film.crop_offset()) - grid.border
+
+    position = mi.Vector2f(pixel) + sampler.next_2d(active)
+    scale = dr.rcp(mi.ScalarVector2f(film.crop_size()))
+    offset = -mi.ScalarVector2f(film.crop_offset()) * scale
+    relative = mi.Point2f(dr.fma(position, mi.Vector2f(scale), mi.Vector2f(offset)))
+    aperture = sampler.next_2d(active) if sensor.needs_aperture_sample() else mi.Point2f(0.5)
+    time = sensor.shutter_open()
+    if sensor.shutter_open_time() > 0:
+        time = time + sampler.next_1d(active) * sensor.shutter_open_time()
+    ray, weight = sensor.sample_ray_differential(time, 0, relative, aperture, active)
+    if ray.has_differentials:
+        ray.scale_differential(mi.Float(np.float32(1) / np.sqrt(np.float32(spp))))
+    layer_samples = layers.sample(scene, sampler, ray, sensor.get_medium(), active)
+    # With a box filter, use the pixel itself: the position can be rounded up into the next pixel.
+    block_position = mi.Point2f(pixel) if film.rfilter().is_box_filter() else mi.Point2f(position)
+    if grid.is_divided:
+        block_position -= mi.Vector2f(mi.Vector2i(film.crop_offset()) + mi.Vector2i(0, dr.opaque(mi.Int32, top)))
+    return block_position, active, (_make_block_values(film, weight, *of_layer) for of_layer in layer_samples)
+
+
+def _make_block_values(film, weight, radiance, valid, aovs) -> list:
+    """Return the values that each sample adds to a block of the film."""
+    import drjit as dr
+    import mitsuba as mi
+
+    radiance = mi.Spectrum(radiance) * weight
+    color = [radiance.x] * 3 if mi.is_monochromatic else [radiance.x, radiance.y, radiance.z]
+    alpha = [dr.select(valid, mi.Float(1), 0)] if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else []
+    return [*color, *alpha, mi.Float(1), *aovs]
+
+
+class _PixelGrid:
+    """The sampled pixels, row by row, and their division into bands."""
+
+    def __init__(self, film, spp: int, rows: int):
+        self.film, self.spp = film, spp
+        self.size, self.offset = [int(v) for v in film.crop_size()], [int(v) for v in film.crop_offset()]
+        self.height = self.size[1]
+        self.rows = min(rows or self.height, self.height)
+        self.is_divided = self.rows < self.height
+        filters = film.rfilter()
+        self.border = int(filters.border_size()) if film.sample_border() else 0
+        self._filter_radius = _filter_radius(film)
+        self.width = self.size[0] + 2 * self.border
+        self.total = sum(b - a for a, b in map(self.sample_range, range(0, self.height, self.rows)))
+
+    def sample_range(self, top: int) -> tuple[int, int]:
+        """Return the first sample that contributes to the band at ``top``, and the end of the range."""
+        first = max(top - self._filter_radius + self.border, 0)
+        last = min(top + self.rows + self._filter_radius + self.border, self.height + 2 * self.border)
+        if not self.is_divided:
+            first, last = 0, self.height + 2 * self.border
+        return first * self.width * self.spp, last * self.width * self.spp
+
+    def make_block(self, aov_names: list[str]):
+        """Make the block that accumulates the samples of a band."""
+        with self._crop_to_band():
+            self.film.prepare(aov_names)
+            block = self.film.create_block()
+            block.set_offset(self.film.crop_offset())
+        block.set_coalesce(block.coalesce() and self.spp >= 4)
+        return block
+
+    @contextmanager
+    def match_accumulation(self, block, layers: LayerSource):
+        """Accumulate samples as Dr.Jit does for the undivided image.
+
+        Dr.Jit uses another method, which rounds differently, for more than a million values
+        (`dr.set_expand_threshold`). ``block`` is the block of the first layer.
+        """
+        import drjit as dr
+
+        threshold = dr.expand_threshold()
+        channels = block.channel_count() - len(layers.channel_names[0]) + layers.num_channels
+        if self.size[0] * self.size[1] * channels > threshold:
+            dr.set_expand_threshold(0)
+        try:
+            yield
+        finally:
+            dr.set_expand_threshold(threshold)
+
+    def develop(self, aov_names: list[str], block) -> None:
+        """Copy ``block`` into the film."""
+        with self._crop_to_band():
+            self.film.prepare(aov_names)
+            self.film.put_block(block)
+
+    @contextmanager
+    def _crop_to_band(self):
+        # Never while rays are traced: sensors need the size of the whole film. Each band is at the corner of the film,
+        # so that its position is not compiled into the kernel.
+        if not self.is_divided:
+            yield
+            return
+        _set_crop(self.film, [self.size[0], self.rows], [0, 0])
+        try:
+            yield
+        finally:
+            _set_crop(self.film, self.size, self.offset)
+
+
+def _set_crop(film, size, offset) -> None:
+    import mitsuba as mi
+
+    params = mi.traverse(film)
+    params["crop_size"], params["crop_offset"] = mi.ScalarVector2u(size), mi.ScalarPoint2u(offset)
+    params.update()
+
+
+# ---- Channels of an image ----
+
+SURFACE_OPACITY = 0.5
+"""Opacity above which a pixel counts as a surface; the default of the integrator."""
+
+
+@dataclass(frozen=True, eq=False)
+class Channels:
+    """The channels of an image.
+
+    Parameters
+    ----------
+    color : ndarray of shape (h, w, 3)
+        Linear radiance.
+    aovs : dict of str to ndarray of shape (h, w)
+        AOVs by name; components of vectors as in ``position.X``.
+    bitmap : mi.Bitmap
+        All channels.
+    """
+
+    color: np.ndarray
+    aovs: dict[str, np.ndarray]
+    bitmap: mi.Bitmap
+
+    @property
+    def mask(self) -> np.ndarray:
+        """Whether a pixel shows a surface (h, w), bool. Requires the AOV ``opacity``."""
+        return self.aovs["opacity"] >= SURFACE_OPACITY
+
+
+def render_channels(
+    scene, sensor, spp: int = 0, seed: int = 0, on_strip: Callable[[int, int], None] | None = None
+) -> Channels:
+    """Render an image with the integrator of the scene, as ``mi.render`` does.
+
+    Parameters
+    ----------
+    scene : mi.Scene
+        The scene.
+    sensor : mi.Sensor
+        The camera.
+    spp : int
+        Samples per pixel; 0 uses the number of the sampler.
+    seed : int
+        Seed of the rendering.
+    on_strip : callable, optional
+        Called several times per second with the number of finished samples and of all samples. It may raise an
+        exception.
+
+    Returns
+    -------
+    Channels
+        Colour and AOVs.
+    """
+    (band,) = render_bands(scene, sensor, spp=spp, seed=seed, on_strip=on_strip)
+    return read_channels(band.film, scene.integrator().aov_names())
+
+
+def read_channels(film, aov_names: Sequence[str]) -> Channels:
+    """Read the channels of a developed ``film`` whose last channels are the AOV channels ``aov_names``."""
+    names = [name.split(".") for name in aov_names]
+    pixels = np.array(film.develop())
+    color = pixels[..., : pixels.shape[2] - len(names)]
+    first = color.shape[2]
+    vectors = {parts[0] for parts in names if [p[0] for p in names].count(parts[0]) > 1}
+    key = lambda parts: ".".join(parts) if parts[0] in vectors else parts[0]
+    aovs = {key(parts): pixels[..., first + k] for k, parts in enumerate(names)}
+    # Mono variants render one channel.
+    return Channels(np.broadcast_to(color[..., :3], (*color.shape[:2], 3)), aovs, film.bitmap())
+
+
+# ---- AOVs in addition to those of a scene file ----
+
+
+class AovLayer:
+    """A layer with colour and chosen AOVs, for the observer of the scene.
+
+    Parameters
+    ----------
+    integrator : NergIntegrator
+        The integrator of the scene.
+    sensor : mi.Sensor
+        The camera.
+    aovs : sequence of str
+        Names of AOVs, which the scene file need not list.
+
+    Raises
+    ------
+    NergError
+        The integrator cannot compute one of the AOVs.
+    """
+
+    def __init__(self, integrator: Any, sensor: Any, aovs: Sequence[str]):
+        self._sensor, self._context = sensor, integrator.make_context(aovs, True)
+        self.channel_names = [self._context.channel_names(self._context.aovs)]
+        self.num_channels = len(self.channel_names[0])
+
+    def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any, active: Any) -> Iterable[tuple]:
+        camera = self._context.trace(scene, [self._sensor], sampler, ray, active)
+        channels = camera.make_pixel().compute_channels(self._context.aovs)
+        radiance, shown, _ = camera.compute_radiance(scene, sampler, medium)
+        return [(radiance, shown, channels)]
+
+
+def is_nerg(integrator: Any) -> bool:
+    """Whether an integrator is `nerg`. Compares names, since each change of the variant creates a new class."""
+    return type(integrator).__name__ == "NergIntegrator"
+
+
+def require_nerg(path: Path, scene: Any) -> Any:
+    """Return the integrator of ``scene``, loaded from ``path``. Raises `NergError` if it is not `nerg`."""
+    integrator = scene.integrator()
+    if not is_nerg(integrator):
+        kind = "none" if integrator is None else f'"{integrator.class_name()}"'
+        raise NergError(
+            f'an overlay needs the integrator "nerg", but "{path}" has {kind}; '
+            f'use "nerg scene {path} -o new.xml" to add it'
+        )
+    return integrator
+
+
+def render_aovs(
+    path: Path,
+    scene: Any,
+    sensor: Any,
+    names: Sequence[str],
+    spp: int = 0,
+    seed: int = 0,
+    on_strip: Callable[[int, int], None] | None = None,
+) -> Channels:
+    """Render colour and chosen AOVs of a scene.
+
+    Parameters
+    ----------
+    path : Path
+        File of the scene, for messages.
+    scene : mi.Scene
+        The scene, whose integrator is `nerg`.
+    sensor : mi.Sensor
+        The camera.
+    names : sequence of str
+        Names of AOVs.
+    spp, seed, on_strip
+        As for `render_channels`.
+
+    Returns
+    -------
+    Channels
+        Colour and AOVs.
+
+    Raises
+    ------
+    NergError
+        The integrator is not `nerg` or cannot compute an AOV, or the image cannot be divided (`undividable_reason`).
+    """
+    integrator = require_nerg(path, scene)
+    reason = undividable_reason(scene, sensor)
+    if reason is not None:
+        raise NergError(f'"{path}" cannot be rendered with an overlay because of {reason}; use another sensor')
+    layer = AovLayer(integrator, sensor, names)
+    (band,) = render_bands(scene, sensor, spp=spp, seed=seed, on_strip=on_strip, layers=layer)
+    return read_channels(band.film, layer.channel_names[0])
+
+
+# ---- Long renderings ----
+#
+# Kernels with constant network weights take seconds to compile. Whether they are faster then depends on the processor.
+
+LONG_RENDER_SAMPLES = 1 << 27
+"""Number of samples from which the compilation of constant weights pays off: 146 images of 1280 x 720."""
+
+_TRIAL_IMAGES = 3  # Images of each kind, of which the first one compiles and is not timed
+
+
+class ConstantWeightsTrial:
+    """Decides in a long sequence of images whether constant network weights are faster on this machine.
+
+    The first images are rendered with variable weights, the next ones with constant weights, and all others with what
+    was faster. Images are equal in both cases.
+
+    Parameters
+    ----------
+    images : int
+        Number of images of the sequence. Short sequences have variable weights only.
+    """
+
+    def __init__(self, images: int):
+        self._images = images
+        self._seconds: dict[bool, list[float]] = {False: [], True: []}  # Per sample, of each image
+
+    def prepare(self, samples: int, scene: Any) -> bool:
+        """Set the weights of ``scene`` for the next image, of ``samples`` samples; return whether they are constant."""
+        integrator = scene.integrator()
+        trained = get_trained_fields(integrator) if is_nerg(integrator) else []
+        constant = bool(trained) and self._choose(samples)
+        for field in trained if constant else ():
+            set_constant_weights(field)
+        return constant
+
+    def record(self, constant: bool, samples: int, seconds: float) -> None:
+        """Record the time of an image."""
+        self._seconds[constant].append(seconds / samples)
+
+    def _choose(self, samples: int) -> bool:
+        variable, constant = self._seconds[False], self._seconds[True]
+        if self._images < 4 * _TRIAL_IMAGES or self._images * samples < LONG_RENDER_SAMPLES:
+            return False
+        if len(variable) < _TRIAL_IMAGES or len(constant) < _TRIAL_IMAGES:
+            return len(variable) >= _TRIAL_IMAGES
+        return min(constant[1:]) < min(variable[1:])
+
+
+def get_trained_fields(integrator: Any) -> list[RadianceNetwork | GazeNetwork]:
+    """Return the radiance field and the gaze field of an integrator `nerg`, if present."""
+    medium, gaze = integrator.medium, integrator.gaze
+    trained: list[RadianceNetwork | GazeNetwork] = [medium.field] if isinstance(medium, FieldMedium) else []
+    return trained if gaze is None else [*trained, gaze.field]

@@ -1,1 +1,0 @@
-"""Attention statistics of AOIs: hits, visits, dwell time, hit ratio, and confidence intervals over participants."""
