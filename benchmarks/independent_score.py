@@ -102,7 +102,7 @@ def main(argv=None) -> None:
     base = prior(train, directions, args.prior_kappa)
     count, kappa, m = tune(train, args.prior_kappa)
     methods = {
-        "gaze field": nerg.load_gaze(args.gaze).density(origins, directions),
+        "gaze field": nerg.GazeField.load(args.gaze).density(origins, directions),
         f"re-aimed hits ({count} rays, kappa {kappa}, prior weight {m})": (1 - m)
         * reaimed(train, origins, directions)[count, kappa]
         + m * base,

@@ -41,9 +41,9 @@ if TYPE_CHECKING:
         import_checkpoint,
     )
     from .environment.environment import Environment
-    from .environment.gaze import GazeField, load_gaze
+    from .environment.gaze import GazeField
     from .environment.queries import observe, trace
-    from .environment.radiance import RadianceField, load_field
+    from .environment.radiance import RadianceField
     from .environment.scene import Scene, make_scene
     from .environment.scene_file import write_scene
     from .errors import NergError
@@ -123,8 +123,6 @@ _MODULES = {
     "guess": "nerg_mi.tracking.imports",
     "import_checkpoint": "nerg_mi.environment.conversion",
     "import_rays": "nerg_mi.tracking.imports",
-    "load_field": "nerg_mi.environment.radiance",
-    "load_gaze": "nerg_mi.environment.gaze",
     "load_photos": "nerg_mi.photos.images",
     "load_rays": "nerg_mi.tracking.dataset",
     "make_scene": "nerg_mi.environment.scene",
@@ -190,8 +188,6 @@ __all__ = [
     "guess",
     "import_checkpoint",
     "import_rays",
-    "load_field",
-    "load_gaze",
     "load_photos",
     "load_rays",
     "make_scene",

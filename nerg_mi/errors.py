@@ -62,7 +62,7 @@ class NergError(ValueError):
 
     >>> import nerg_mi as nerg
     >>> try:
-    ...     nerg.load_field("nowhere.safetensors")
+    ...     nerg.RadianceField.load("nowhere.safetensors")
     ... except nerg.NergError as error:
     ...     print(error)
     the checkpoint "nowhere.safetensors" does not exist: correct its name, or make one with "nerg train"

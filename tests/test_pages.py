@@ -202,7 +202,7 @@ def test_scenes_are_exported(rgb, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     room = trimesh.creation.box((8, 6, 3)).apply_translation((4, 3, 1.5))
     room.export("day.ply")
-    gaze = nerg.load_gaze(SCENE_FILE.parent / "shoppers.safetensors")
+    gaze = nerg.GazeField.load(SCENE_FILE.parent / "shoppers.safetensors")
     names = {"nerg": nerg, "room": room, "gaze": gaze, "camera": nerg.Camera((1, 1, 2), (5, 4, 1), width=12, height=8)}
     names["rays"] = nerg.Rays.from_arrays([[4, 3, 1.6]] * 9, [[1, 0, 0]] * 9, times=np.arange(9) / 30)
     (block,) = blocks("py", page="exchange.md")
@@ -466,7 +466,7 @@ def test18_python(rgb, tmp_path, monkeypatch):
             assert share.max() > 0.01 and share[3, -1] > share[3, 0]
             assert names["view"].gaze.shape == (2, 16, 24)
     assert (tmp_path / "attention.png").stat().st_size > 10_000
-    assert nerg.load_field(tmp_path / "copy.safetensors").kind == "radiance"
+    assert nerg.RadianceField.load(tmp_path / "copy.safetensors").kind == "radiance"
     assert names["on_display"].share.shape == (1,) and names["on_display"].share[0] > 0
     assert names["seen"].gaze.shape == (1, 2) and names["down"].color.shape == (2, 3)
     assert 1.5 < names["down"].depth[0] < 1.7

@@ -208,7 +208,7 @@ def export_mesh(
     --------
     >>> import nerg_mi as nerg
     >>> from importlib.resources import files
-    >>> field = nerg.load_field(files("nerg_mi.scenes.store") / "store.safetensors")
+    >>> field = nerg.RadianceField.load(files("nerg_mi.scenes.store") / "store.safetensors")
     >>> mesh = nerg.export_mesh(field, resolution=32)
     >>> mesh.save(folder / "store.ply")
     """
@@ -271,7 +271,7 @@ def export_points(
     --------
     >>> import nerg_mi as nerg
     >>> from importlib.resources import files
-    >>> field = nerg.load_field(files("nerg_mi.scenes.store") / "store.safetensors")
+    >>> field = nerg.RadianceField.load(files("nerg_mi.scenes.store") / "store.safetensors")
     >>> 0 < len(nerg.export_points(field, resolution=32, max_points=100).vertices) <= 100
     True
     """
@@ -316,7 +316,7 @@ def export_splats(
     --------
     >>> import nerg_mi as nerg
     >>> from importlib.resources import files
-    >>> field = nerg.load_field(files("nerg_mi.scenes.store") / "store.safetensors")
+    >>> field = nerg.RadianceField.load(files("nerg_mi.scenes.store") / "store.safetensors")
     >>> splats = nerg.export_splats(field, resolution=16)
     >>> splats.save(folder / "store.ply")
     """
@@ -366,7 +366,7 @@ def export_volume(
     --------
     >>> import nerg_mi as nerg
     >>> from importlib.resources import files
-    >>> field = nerg.load_field(files("nerg_mi.scenes.store") / "store.safetensors")
+    >>> field = nerg.RadianceField.load(files("nerg_mi.scenes.store") / "store.safetensors")
     >>> grid = nerg.export_volume(field, resolution=16)
     >>> grid.save(folder / "store.vol")
     """
@@ -401,7 +401,7 @@ def export_torch_ngp(field: RadianceField | FilePath, *, progress: Progress = No
     --------
     >>> import nerg_mi as nerg
     >>> from importlib.resources import files
-    >>> field = nerg.load_field(files("nerg_mi.scenes.store") / "store.safetensors")
+    >>> field = nerg.RadianceField.load(files("nerg_mi.scenes.store") / "store.safetensors")
     >>> try:
     ...     nerg.export_torch_ngp(field)
     ... except nerg.NergError as error:

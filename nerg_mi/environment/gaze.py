@@ -16,8 +16,7 @@ from nerg_mi.errors import NergError, parameter, sanitize, translate_mitsuba_err
 from nerg_mi.fields.gaze_base import GazeNetwork
 from nerg_mi.files.html import Summary
 from nerg_mi.files.values import FilePath, to_numbers, to_path
-from nerg_mi.formats.fields import load_gaze as read_gaze
-from nerg_mi.formats.fields import matches_checksum, save_gaze
+from nerg_mi.formats.fields import load_gaze, matches_checksum, save_gaze
 from nerg_mi.maths import vmf
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
@@ -38,7 +37,7 @@ _FILES = ("field_file", "scene_file", "geometry_file")
 
 @dataclass(frozen=True, eq=False, repr=False)
 class GazeField(TrainedField[GazeNetwork]):
-    """A gaze field in memory, as `load_gaze` and `train_gaze` return it.
+    """A gaze field in memory, loaded from a file or returned by `train_gaze`.
 
     Attributes
     ----------
@@ -50,7 +49,7 @@ class GazeField(TrainedField[GazeNetwork]):
     --------
     >>> import nerg_mi as nerg
     >>> from importlib.resources import files
-    >>> gaze = nerg.load_gaze(files("nerg_mi.scenes.store") / "shoppers.safetensors")
+    >>> gaze = nerg.GazeField.load(files("nerg_mi.scenes.store") / "shoppers.safetensors")
     >>> isinstance(gaze, nerg.GazeField), gaze.kind
     (True, 'gaze')
     """
@@ -62,7 +61,7 @@ class GazeField(TrainedField[GazeNetwork]):
 
     @staticmethod
     def _read(path: Path, ns: ModuleType) -> tuple[GazeNetwork, dict[str, Any]]:
-        return read_gaze(path, ns)
+        return load_gaze(path, ns)
 
     def _write(self, path: Path, half: bool) -> None:
         save_gaze(self.network, path, dict(self.provenance), half)
@@ -134,7 +133,7 @@ class GazeField(TrainedField[GazeNetwork]):
         >>> import nerg_mi as nerg
         >>> from importlib.resources import files
         >>> store = files("nerg_mi.scenes.store")
-        >>> gaze = nerg.load_gaze(store / "shoppers.safetensors")  # trained in store.safetensors, next to it
+        >>> gaze = nerg.GazeField.load(store / "shoppers.safetensors")  # trained in store.safetensors, next to it
         >>> density = gaze.density((4.4, 2.8, 1.6), [(0, 1, 0), (0, 0, 1)])
         >>> density.shape, bool(density[0] > density[1] > 0)
         ((2,), True)
@@ -237,7 +236,7 @@ class GazeField(TrainedField[GazeNetwork]):
         --------
         >>> import nerg_mi as nerg
         >>> from importlib.resources import files
-        >>> gaze = nerg.load_gaze(files("nerg_mi.scenes.store") / "shoppers.safetensors")
+        >>> gaze = nerg.GazeField.load(files("nerg_mi.scenes.store") / "shoppers.safetensors")
         >>> rays = nerg.Rays.from_arrays([[4.4, 2.8, 1.6]] * 2, [[0, 1, 0], [0.2, 1, 0]], times=[0, 1])
         >>> gaze.score(rays) > -2.53
         True
@@ -288,7 +287,7 @@ class GazeField(TrainedField[GazeNetwork]):
         --------
         >>> import nerg_mi as nerg
         >>> from importlib.resources import files
-        >>> gaze = nerg.load_gaze(files("nerg_mi.scenes.store") / "shoppers.safetensors")
+        >>> gaze = nerg.GazeField.load(files("nerg_mi.scenes.store") / "shoppers.safetensors")
         >>> gaze.sample((4.4, 2.8, 1.6), 100).shape
         (100, 3)
         """
@@ -336,7 +335,7 @@ class GazeField(TrainedField[GazeNetwork]):
         --------
         >>> import nerg_mi as nerg
         >>> from importlib.resources import files
-        >>> gaze = nerg.load_gaze(files("nerg_mi.scenes.store") / "shoppers.safetensors")
+        >>> gaze = nerg.GazeField.load(files("nerg_mi.scenes.store") / "shoppers.safetensors")
         >>> regions = gaze.regions((4.4, 2.8, 1.6), levels=(0.5, 0.9))
         >>> regions.inside.shape, bool(regions.solid_angle[0] < regions.solid_angle[1])
         ((2, 16384), True)
@@ -572,33 +571,3 @@ def read_training_alignment(provenance: Mapping[str, Any]) -> Similarity:
 def find_environment_record(provenance: Mapping[str, Any]) -> Mapping[str, Any] | None:
     """Return the name (``file``) and the checksum (``sha256``) of the environment of a gaze field, or None."""
     return next((provenance[key] for key in _FILES if key in provenance), None)
-
-
-def load_gaze(path: FilePath) -> GazeField:
-    """Load a gaze field or an ensemble of gaze fields.
-
-    Parameters
-    ----------
-    path : path
-        A checkpoint written by ``nerg train gaze``, `train_gaze` or ``nerg import``.
-
-    Returns
-    -------
-    GazeField
-        The field, for `make_scene`; its method ``density`` returns densities of rays.
-
-    Raises
-    ------
-    NergError
-        The file does not exist, is damaged, or contains something else.
-
-    Examples
-    --------
-    >>> import nerg_mi as nerg
-    >>> from importlib.resources import files
-    >>> store = files("nerg_mi.scenes.store")
-    >>> gaze = nerg.load_gaze(store / "shoppers.safetensors")
-    >>> gaze.kind
-    'gaze'
-    """
-    return GazeField.load(path)

@@ -174,7 +174,7 @@ def trace(
     -------
     TraceResult
         Arrays (M, N, ...), or (N, ...) without ``observers``. ``gaze`` is 0 where a ray meets no surface; the method
-        ``density`` of a gaze field is not (`load_gaze`).
+        ``density`` of a gaze field is not (`GazeField`).
 
     Raises
     ------
@@ -187,7 +187,7 @@ def trace(
     8,000 directions or more. In the demo store this takes 30 to 50 ms of CPU time per origin, or half a minute to a
     minute for 1,000 origins. A larger ``integral_tolerance`` of the scene (``make_scene(...,
     integral_tolerance=0.02)``: a relative error of at most 2 %) halves this time. The method ``density`` of a gaze
-    field (`load_gaze`) computes the integrals of many origins together, in about 10 ms per origin with its default
+    field (`GazeField`) computes the integrals of many origins together, in about 10 ms per origin with its default
     tolerance. Quantities other than gaze do not need the integral.
 
     Examples

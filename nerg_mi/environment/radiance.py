@@ -12,7 +12,6 @@ import numpy as np
 
 from nerg_mi.fields.radiance import RadianceNetwork
 from nerg_mi.files.atomic import file_sha256
-from nerg_mi.files.values import FilePath
 from nerg_mi.formats.fields import load_radiance, save_radiance
 
 from .trained import TrainedField
@@ -20,7 +19,7 @@ from .trained import TrainedField
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RadianceField(TrainedField[RadianceNetwork]):
-    """A radiance field in memory, as `load_field` and `train_radiance` return it.
+    """A radiance field in memory, loaded from a file or returned by `train_radiance`.
 
     Examples
     --------
@@ -73,33 +72,3 @@ def describe_psnr(provenance: Mapping[str, Any]) -> str | None:
     validation = get_validation_views(provenance)
     scores = [x for name, x in views.items() if name not in validation and isinstance(x, float)]
     return f"{np.mean(scores):.1f} dB PSNR on {len(scores)} held-out photos" if scores else None
-
-
-def load_field(path: FilePath) -> RadianceField:
-    """Load a radiance field: density and colour of an environment.
-
-    Parameters
-    ----------
-    path : path
-        A checkpoint written by ``nerg train radiance``, `train_radiance` or ``nerg import``.
-
-    Returns
-    -------
-    RadianceField
-        The field, for `make_scene`.
-
-    Raises
-    ------
-    NergError
-        The file does not exist, is damaged, or contains something else.
-
-    Examples
-    --------
-    >>> import nerg_mi as nerg
-    >>> from importlib.resources import files
-    >>> store = files("nerg_mi.scenes.store")
-    >>> field = nerg.load_field(store / "store.safetensors")
-    >>> field.bounds.tolist()
-    [[-0.1, -0.1, -0.1], [8.1, 6.1, 3.1]]
-    """
-    return RadianceField.load(path)

@@ -435,13 +435,13 @@ def make_scene(
     Parameters
     ----------
     environment : AnyEnvironment, optional
-        What the observers see: a radiance field (`load_field`, `train_radiance`), Gaussian splats
+        What the observers see: a radiance field (`RadianceField`), Gaussian splats
         (`nerg_mi.fields.splats.Splats`) or a `DensityGrid`, in memory or as a file; a file of hit points (.vol) as
         written by `train_gaze` with ``geometry="hits"``; or shapes as for ``shapes``. Hit points are grey, shaded by
         the orientation of their surfaces. Of a `Scene` of `make_scene`, or a dict of one, all is kept that no argument
         replaces: its gaze field, observer and cameras too. Of other scenes only shapes and lights are used.
     gaze : GazeField or path, optional
-        The gaze field (`load_gaze`, `train_gaze`), in memory or as a file.
+        The gaze field (`GazeField`), in memory or as a file.
     shapes : object, optional
         Further shapes: a mesh or scene of trimesh, a mesh file (.ply, .obj, .glb), a scene file, a dict for
         ``mi.load_dict``, a Mitsuba scene or shape, or several of these in a list or in a dict by name.

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
 from nerg_mi.environment.environment import Environment
-from nerg_mi.environment.gaze import GazeField, load_gaze
+from nerg_mi.environment.gaze import GazeField
 from nerg_mi.environment.planned import PlannedFiles
 from nerg_mi.environment.scene import AnyEnvironment
 from nerg_mi.errors import NergError, parameter
@@ -288,7 +288,7 @@ def _read_parts(
     plan = Plan(f"nerg eval folds {os.path.abspath(folder)}", train_and_score, common, tasks, FOLDER_SUFFIX, libraries)
     for seed, made in zip(seeds, runner.run(plan)):
         results: Any = read_json(made.path / SCORED, "scores of a fold")
-        yield seed, load_gaze(made.path / FIELD), results
+        yield seed, GazeField.load(made.path / FIELD), results
 
 
 def train_and_score(common: FoldInputs, seed: int, output: Path) -> None:

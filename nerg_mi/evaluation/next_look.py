@@ -40,7 +40,7 @@ from .baselines import MIN_AIM_DISTANCE, UNIFORM_DENSITY
 from .gaze import EPS
 
 RayDensity = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""Density (N,) in 1/sr of rays with origins (N, 3) and directions (N, 3), such as ``nerg.load_gaze(FILE).density``."""
+"""Density (N,) in 1/sr of rays with origins (N, 3) and directions (N, 3), such as the ``density`` of a `GazeField`."""
 
 RayDistance = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Distance (N,) in metres to the surface along rays with origins (N, 3) and directions (N, 3); not finite: none."""

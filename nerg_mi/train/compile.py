@@ -95,7 +95,7 @@ def compile_field(
     --------
     >>> import nerg_mi as nerg
     >>> from importlib.resources import files
-    >>> field = nerg.load_field(files("nerg_mi.scenes.store") / "store.safetensors")
+    >>> field = nerg.RadianceField.load(files("nerg_mi.scenes.store") / "store.safetensors")
     >>> small = nerg.compile_field(field, resolution=128)
     >>> small.provenance["compiled"]["resolution"]
     128
@@ -222,7 +222,7 @@ def refine_field(field: RadianceField | FilePath, *, progress: Progress = None) 
     --------
     >>> import nerg_mi as nerg
     >>> from importlib.resources import files
-    >>> field = nerg.load_field(files("nerg_mi.scenes.store") / "store.safetensors")
+    >>> field = nerg.RadianceField.load(files("nerg_mi.scenes.store") / "store.safetensors")
     >>> fine = nerg.refine_field(field)
     >>> fine.network.occupancy.occupied_fraction < field.network.occupancy.coarse.occupied_fraction
     True

@@ -145,7 +145,7 @@ def test_ctrl_c_ends_a_loop_over_trainings(rays, tmp_path, has_output):
     assert 0 < field.provenance["steps"] < 50 and field.provenance["interrupted"]
     assert np.isfinite(field.density(EYE, [(1, 0, 0)])).all()
     if has_output:
-        assert nerg.load_gaze(output).provenance["steps"] == field.provenance["steps"]
+        assert nerg.GazeField.load(output).provenance["steps"] == field.provenance["steps"]
         assert field.path == output and len(list(tmp_path.iterdir())) > 2  # The environment, too
 
 
@@ -165,12 +165,12 @@ def test_environments_train_alike_in_memory_and_saved(rgb_module, rays, tmp_path
     expected = gaze.density(EYE, directions)
     if kind == "mesh":
         # In another process, from what is in the folder.
-        code = f"import nerg_mi as nerg; g = nerg.load_gaze({str(tmp_path / 'gaze.safetensors')!r}); "
+        code = f"import nerg_mi as nerg; g = nerg.GazeField.load({str(tmp_path / 'gaze.safetensors')!r}); "
         code += f"print(g.density({EYE}, {directions}).tolist())"
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
         np.testing.assert_allclose(json.loads(done.stdout), expected, rtol=1e-4, err_msg=done.stderr)
     else:
-        loaded = nerg.load_gaze(tmp_path / "gaze.safetensors")
+        loaded = nerg.GazeField.load(tmp_path / "gaze.safetensors")
         np.testing.assert_allclose(loaded.density(EYE, directions), expected, rtol=1e-4)
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # the same environment again has the same checksum
@@ -241,7 +241,7 @@ def test_environments_are_exported(room, tmp_path, written, kind):
         "mitsuba": lambda: nerg.make_scene(room).mitsuba,
         "dict": lambda: {"type": "scene", "integrator": {"type": "path"}, "wall": {"type": "cube"}},
         "splats": lambda: splats,
-        "field": lambda: nerg.load_field(nerg_store() / "store.safetensors"),
+        "field": lambda: nerg.RadianceField.load(nerg_store() / "store.safetensors"),
         "file": lambda: Path(make_room().export(tmp_path / "room.ply") and tmp_path / "room.ply"),
     }[kind]()
     nerg.export_scene([environment], tmp_path / "a.usdc", max_points=100)

@@ -59,7 +59,7 @@ def some_rays(count=30):
 
 def test01_the_whole_sphere_integrates_to_one(folder):
     """Above the room there is no surface, and the density is positive there."""
-    gaze, d = nerg.load_gaze(folder / "gaze.safetensors"), fibonacci_directions(1 << 13)
+    gaze, d = nerg.GazeField.load(folder / "gaze.safetensors"), fibonacci_directions(1 << 13)
     assert isinstance(gaze, GazeField)
     for eye in EYES:
         density = gaze.density(eye, d)
@@ -68,7 +68,7 @@ def test01_the_whole_sphere_integrates_to_one(folder):
 
 
 def test02_the_density_is_the_gaze_of_a_scene_where_there_are_surfaces(folder):
-    gaze, d = nerg.load_gaze(folder / "gaze.safetensors"), fibonacci_directions(400)
+    gaze, d = nerg.GazeField.load(folder / "gaze.safetensors"), fibonacci_directions(400)
     scene = nerg.make_scene(gaze=gaze, shapes=folder / "room.xml")
     for eye in EYES:
         traced = nerg.trace(scene, eye, d, ["gaze", "opacity"])
@@ -80,7 +80,7 @@ def test02_the_density_is_the_gaze_of_a_scene_where_there_are_surfaces(folder):
 
 
 def test03_origins_and_directions_are_broadcast(folder):
-    gaze, (o, d) = nerg.load_gaze(folder / "gaze.safetensors"), some_rays()
+    gaze, (o, d) = nerg.GazeField.load(folder / "gaze.safetensors"), some_rays()
     density = gaze.density(o, 3 * d)
     np.testing.assert_allclose(density[::2], gaze.density(tuple(EYES[0]), d[::2]), rtol=1e-5)
     np.testing.assert_allclose(gaze.density(o[:2], d[0])[:1], density[:1], rtol=1e-5)
@@ -93,7 +93,7 @@ def test03_origins_and_directions_are_broadcast(folder):
 
 
 def test04_the_alignment_is_applied(folder):
-    gaze, aligned = (nerg.load_gaze(folder / f"{name}.safetensors") for name in ("gaze", "aligned"))
+    gaze, aligned = (nerg.GazeField.load(folder / f"{name}.safetensors") for name in ("gaze", "aligned"))
     o, d = some_rays()
     inside = gaze.density(o @ ALIGN[:3, :3].T + ALIGN[:3, 3], d @ TURN.T)
     np.testing.assert_allclose(aligned.density(o, d), inside, rtol=1e-3)
@@ -103,7 +103,7 @@ def test04_the_alignment_is_applied(folder):
 def test05_every_kind_of_geometry(folder):
     """A file, and the same in memory, equal the evaluation."""
 
-    gaze, (o, d) = nerg.load_gaze(folder / "unknown.safetensors"), some_rays(6)
+    gaze, (o, d) = nerg.GazeField.load(folder / "unknown.safetensors"), some_rays(6)
     for name, load in (
         ("room.xml", Environment.open),
         ("block.ply", Environment.open),
@@ -115,29 +115,29 @@ def test05_every_kind_of_geometry(folder):
         for eye in (0, 1):
             np.testing.assert_allclose(result[eye::2], expected(EYES[eye], d[eye::2])[0], rtol=1e-4)
         if name == "field.safetensors":
-            memory = nerg.load_field(folder / name)
+            memory = nerg.RadianceField.load(folder / name)
             np.testing.assert_array_equal(gaze.density(o, d, environment=memory, tolerance=5e-3), result)
 
 
 def test06_a_scene_may_move_the_field(folder):
-    gaze, (o, d) = nerg.load_gaze(folder / "unknown.safetensors"), some_rays(6)
-    field = nerg.load_field(folder / "field.safetensors")
+    gaze, (o, d) = nerg.GazeField.load(folder / "unknown.safetensors"), some_rays(6)
+    field = nerg.RadianceField.load(folder / "field.safetensors")
     moved = nerg.make_scene(field, gaze, to_world=np.linalg.inv(ALIGN))
     expected = gaze.density(o, d, environment=nerg.make_scene(field, gaze))
     np.testing.assert_allclose(gaze.density(o, d, environment=moved), expected, rtol=2e-3)
 
 
 def test07_missing_geometry_is_an_error_that_names_the_option(folder, tmp_path):
-    gaze, (o, d) = nerg.load_gaze(folder / "gaze.safetensors"), some_rays(2)
+    gaze, (o, d) = nerg.GazeField.load(folder / "gaze.safetensors"), some_rays(2)
     shutil.copy(folder / "gaze.safetensors", tmp_path)
-    lonely = nerg.load_gaze(tmp_path / "gaze.safetensors")
+    lonely = nerg.GazeField.load(tmp_path / "gaze.safetensors")
     with pytest.raises(nerg.NergError, match=r'room.xml", which the field .* does not exist; give .* with environment'):
         lonely.density(o, d)
     (tmp_path / "room.xml").write_text(ROOM.replace("0.5", "0.4"))
     with pytest.raises(nerg.NergError, match=r'room.xml" is not the file that .* was trained in; .* with environment'):
         lonely.density(o, d)
     with pytest.raises(nerg.NergError, match=r"does not store the geometry .*; give .* with environment"):
-        nerg.load_gaze(folder / "unknown.safetensors").density(o, d)
+        nerg.GazeField.load(folder / "unknown.safetensors").density(o, d)
     in_memory = GazeField(gaze.network, gaze.provenance)
     with pytest.raises(nerg.NergError, match=r'environment of its training, "room.xml", .* with environment'):
         in_memory.density(o, d)
@@ -146,7 +146,7 @@ def test07_missing_geometry_is_an_error_that_names_the_option(folder, tmp_path):
 
 
 def test08_other_objects_are_no_geometry(folder):
-    gaze, (o, d) = nerg.load_gaze(folder / "gaze.safetensors"), some_rays(2)
+    gaze, (o, d) = nerg.GazeField.load(folder / "gaze.safetensors"), some_rays(2)
     for geometry, message in (
         (3, "got int"),
         (gaze, "contains a gaze field and is no environment"),
@@ -158,7 +158,7 @@ def test08_other_objects_are_no_geometry(folder):
 
 
 def test09_a_field_without_surfaces_needs_no_geometry(folder):
-    gaze, (o, d) = nerg.load_gaze(folder / "none.safetensors"), some_rays(6)
+    gaze, (o, d) = nerg.GazeField.load(folder / "none.safetensors"), some_rays(6)
     expected = FieldDensity(gaze.network, None)(EYES, d)[np.arange(6) % 2, np.arange(6)]
     np.testing.assert_allclose(gaze.density(o, d, tolerance=5e-3), expected, rtol=1e-4)
     np.testing.assert_array_equal(gaze.density(o, d, environment=folder / "block.ply"), gaze.density(o, d))
@@ -177,7 +177,7 @@ def test10_another_geometry_is_reported(folder):
         def progress(self, share, text=""):
             self.shares.append((share, text))
 
-    gaze, (o, d) = nerg.load_gaze(folder / "gaze.safetensors"), some_rays(2)
+    gaze, (o, d) = nerg.GazeField.load(folder / "gaze.safetensors"), some_rays(2)
     listener = Listener()
     gaze.density(o, d, environment=folder / "room.xml", progress=listener)
     assert not any("was not trained in" in text for text in listener.warnings)
@@ -187,7 +187,7 @@ def test10_another_geometry_is_reported(folder):
 
 
 def test11_a_changed_file_is_read_again(folder, tmp_path):
-    gaze, (o, d) = nerg.load_gaze(folder / "unknown.safetensors"), some_rays(6)
+    gaze, (o, d) = nerg.GazeField.load(folder / "unknown.safetensors"), some_rays(6)
     path = tmp_path / "room.xml"
     path.write_text(ROOM)
     before = gaze.density(o, d, environment=path)
@@ -197,7 +197,7 @@ def test11_a_changed_file_is_read_again(folder, tmp_path):
 
 
 def test12_another_variant_is_refused(folder, monkeypatch):
-    gaze, (o, d) = nerg.load_gaze(folder / "gaze.safetensors"), some_rays(2)
+    gaze, (o, d) = nerg.GazeField.load(folder / "gaze.safetensors"), some_rays(2)
     import drjit.cuda.ad as other
 
     monkeypatch.setattr(gaze_api, "get_array_module", lambda: other)

@@ -15,7 +15,7 @@ from tests.recorder import Recorder
 def test01_the_density_is_the_fields(scene, rgb):
     observer = SceneObserver(scene, np.float32((0.3, -3, 0.4)))
     p_od, r_o = rgb.Point3f(0.2, -0.5, 0.1), dr.normalize(rgb.Vector3f(-0.1, 2.5, -0.3))
-    field = nerg.load_gaze(scene.integrator.children["gaze"].filename).network
+    field = nerg.GazeField.load(scene.integrator.children["gaze"].filename).network
     expected = field.evaluate(p_od, rgb.Point3f(0.3, -3, 0.4), r_o)[0]
     assert np.isclose(observer.eval_gaze(p_od, observer.center, r_o, True)[0], expected[0], rtol=1e-5)
 

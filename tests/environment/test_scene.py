@@ -35,7 +35,7 @@ def test01_scene_representation(files, camera):
 
 
 def test02_a_field_in_memory_is_its_file(files, camera):
-    field, gaze = nerg.load_field(files / "field.safetensors"), nerg.load_gaze(files / "gaze.safetensors")
+    field, gaze = nerg.RadianceField.load(files / "field.safetensors"), nerg.GazeField.load(files / "gaze.safetensors")
     from_files = nerg.make_scene(files / "field.safetensors", files / "gaze.safetensors", camera=camera)
     expected = nerg.render(from_files, spp=2)
     for made in (
@@ -140,7 +140,7 @@ def test07_errors_are_sentences(files, arguments, said):
 
 
 def test08_wrong_kinds_are_refused(files):
-    field, gaze = nerg.load_field(files / "field.safetensors"), nerg.load_gaze(files / "gaze.safetensors")
+    field, gaze = nerg.RadianceField.load(files / "field.safetensors"), nerg.GazeField.load(files / "gaze.safetensors")
     with pytest.raises(nerg.NergError, match="pass it with gaze="):
         nerg.make_scene(gaze)
     with pytest.raises(nerg.NergError, match="gaze must be a gaze field.*radiance field field.safetensors"):

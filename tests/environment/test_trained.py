@@ -8,7 +8,7 @@ from nerg_mi.environment.gaze import GazeField
 
 
 def test01_a_field_has_the_data_of_its_file(files):
-    field = nerg.load_field(files / "field.safetensors")
+    field = nerg.RadianceField.load(files / "field.safetensors")
     assert field.kind == "radiance" and field.name == "field.safetensors" and field.provenance == {"test": 0}
     assert np.array_equal(field.bounds, [(-1, -1, -1), (1, 1, 1)])
     assert field.num_weights == sum(value.numpy().size for value in field.network.parameters().values())
@@ -18,7 +18,7 @@ def test01_a_field_has_the_data_of_its_file(files):
 
 
 def test02_saved_fields_are_equal(files, tmp_path):
-    for load, name in ((nerg.load_field, "field"), (nerg.load_gaze, "gaze")):
+    for load, name in ((nerg.RadianceField.load, "field"), (nerg.GazeField.load, "gaze")):
         field = load(str(files / f"{name}.safetensors"))
         path = field.save(tmp_path / f"{name}.safetensors")
         again = load(path)
@@ -27,7 +27,7 @@ def test02_saved_fields_are_equal(files, tmp_path):
             assert np.array_equal(value.numpy(), again.network.parameters()[key].numpy()), key
 
 
-@pytest.mark.parametrize("load, name", [(nerg.load_field, "field"), (nerg.load_gaze, "gaze")])
+@pytest.mark.parametrize("load, name", [(nerg.RadianceField.load, "field"), (nerg.GazeField.load, "gaze")])
 def test03_half_the_size(files, tmp_path, load, name):
     field = load(files / f"{name}.safetensors")
     full, half = (field.save(tmp_path / f"{h}.safetensors", half=h).stat().st_size for h in (False, True))
@@ -39,9 +39,9 @@ def test03_half_the_size(files, tmp_path, load, name):
 @pytest.mark.parametrize(
     "load, name, said",
     [
-        (nerg.load_field, "gaze.safetensors", "contains a gaze field"),
-        (nerg.load_gaze, "field.safetensors", "contains a radiance field"),
-        (nerg.load_field, "nowhere.safetensors", "does not exist"),
+        (nerg.RadianceField.load, "gaze.safetensors", "contains a gaze field"),
+        (nerg.GazeField.load, "field.safetensors", "contains a radiance field"),
+        (nerg.RadianceField.load, "nowhere.safetensors", "does not exist"),
         (nerg.load_rays, "nowhere.npz", "nowhere.npz"),
         (nerg.load_rays, "field.safetensors", "rays are saved"),
     ],
@@ -53,11 +53,11 @@ def test04_errors_are_sentences(files, load, name, said):
 
 def test05_invalid_names_are_refused(files):
     with pytest.raises(nerg.NergError, match="given as a string"):
-        nerg.load_field(3)
+        nerg.RadianceField.load(3)
     with pytest.raises(nerg.NergError, match="saved as .safetensors"):
-        nerg.load_field(files / "field.safetensors").save(files / "field.ckpt")
+        nerg.RadianceField.load(files / "field.safetensors").save(files / "field.ckpt")
 
 
 def test06_a_field_without_a_file(files):
-    network = nerg.load_gaze(files / "gaze.safetensors").network
+    network = nerg.GazeField.load(files / "gaze.safetensors").network
     assert repr(GazeField(network)).startswith("<gaze field in memory: ")

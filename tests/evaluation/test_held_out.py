@@ -244,7 +244,7 @@ def folds_trained(monkeypatch):
     score.__qualname__ = "train_and_score"
 
     monkeypatch.setattr(folding, "train_and_score", score)
-    monkeypatch.setattr(folding, "load_gaze", lambda path: path)
+    monkeypatch.setattr(GazeField, "load", lambda path: path)
     return seeds
 
 
@@ -282,7 +282,7 @@ def test_missing_values_of_folds_have_a_reason(tmp_path, monkeypatch):
 
     score.__qualname__ = "train_and_score"
     monkeypatch.setattr(folding, "train_and_score", score)
-    monkeypatch.setattr(folding, "load_gaze", lambda path: path)
+    monkeypatch.setattr(GazeField, "load", lambda path: path)
     result = folds(crowd(300), "none", **SMALL, output=tmp_path / "out")
     for name in result.TABLES:
         assert getattr(result, name) and not find_wrong_notes(getattr(result, name)), name

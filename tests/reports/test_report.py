@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from nerg_mi.environment.gaze import load_gaze
+from nerg_mi.environment.gaze import GazeField
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation.gaze_report import write_report
 from nerg_mi.files.atomic import file_sha256
@@ -204,7 +204,7 @@ def test_a_report_without_geometry(rgb):
 
 
 def test_objects_in_memory_give_the_report_of_their_files(without_3d, run):
-    gaze, rays = load_gaze(run / "gaze.safetensors"), Rays.load(run / "rays.npz")
+    gaze, rays = GazeField.load(run / "gaze.safetensors"), Rays.load(run / "rays.npz")
     in_memory = replace(gaze, path=None, name="in memory", environment=gaze.open_environment())
     one, two = (report([field, rays], **SMALL).run for field in (gaze, in_memory))
     assert two.title == "Gaze field" and "volume" not in two.geometry_description

@@ -421,7 +421,7 @@ def test_trained_fields_can_be_rendered(rgb, tmp_path):
     rays = nerg.Rays(np.arange(500.0), np.zeros(500, int), ("Ada",), origin, direction, np.ones(500))
     field = nerg.train_gaze(rays, "none", steps=1, validation_zones=0, probes=4, output=tmp_path / "gaze.safetensors")
     assert field.name == "gaze.safetensors" and field.provenance["steps"] == 1
-    again = nerg.load_gaze(tmp_path / "gaze.safetensors")
+    again = nerg.GazeField.load(tmp_path / "gaze.safetensors")
     walls = {"type": "cube", "to_world": rgb.ScalarTransform4f().scale(4)}
     a, b = (
         nerg.trace(nerg.make_scene(gaze=g, shapes=walls), (1.5, 1.5, 1.5), [(1, 0, 0), (0, 1, 0.1)], "gaze").gaze

@@ -23,7 +23,7 @@ from nerg_mi.environment.conversion import (
     import_checkpoint,
 )
 from nerg_mi.environment.environment import Environment
-from nerg_mi.environment.radiance import RadianceField, load_field
+from nerg_mi.environment.radiance import RadianceField
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation.photos import evaluate_radiance
 from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid
@@ -196,8 +196,8 @@ def test_imported_fields_are_saved_by_kind(torch, tmp_path):
     assert field.kind == "radiance" and gaze.kind == "gaze" and gaze.network.config.variant == "emit_capture"
     assert [p.name for p in tmp_path.iterdir()] == ["nerg.pth"] and len(recorder.messages) == 2
     result.save(tmp_path / "f.safetensors", tmp_path / "g.safetensors")
-    assert load_field(tmp_path / "f.safetensors").half and (tmp_path / "g.safetensors").is_file()
-    assert field.provenance == load_field(tmp_path / "f.safetensors").provenance
+    assert RadianceField.load(tmp_path / "f.safetensors").half and (tmp_path / "g.safetensors").is_file()
+    assert field.provenance == RadianceField.load(tmp_path / "f.safetensors").provenance
     for only in (ImportedFields(field, None), ImportedFields(None, gaze)):
         with pytest.raises(NergError) as error:
             only.save(tmp_path / "a.safetensors", tmp_path / "b.safetensors")
@@ -217,7 +217,7 @@ def field(tmp_path):
 def test_a_field_and_its_file_give_equal_exports(field, tmp_path):
     options, recorder = {"resolution": 16, "density_threshold": 3.0, "max_points": 50}, Recorder()
     first = export_points(field, **options, progress=recorder)
-    second = export_points(load_field(field), **options)
+    second = export_points(RadianceField.load(field), **options)
     assert len(first.vertices) == 50 and recorder.messages[0].startswith("50 points")
     first.save(tmp_path / "a.ply")
     second.save(tmp_path / "b.ply")
@@ -284,9 +284,9 @@ def test_a_gaze_field_accepts_the_refined_checkpoint(files, tmp_path):
 
 
 def test_refinement_keeps_the_object_and_half_precision(files, tmp_path):
-    field = load_field(files[0])
+    field = RadianceField.load(files[0])
     field.save(tmp_path / "half.safetensors", half=True)
-    half = load_field(tmp_path / "half.safetensors")
+    half = RadianceField.load(tmp_path / "half.safetensors")
     refine_field(half).save(tmp_path / "new.safetensors")
     assert isinstance(half.network.occupancy, OccupancyGrid)
     new, old = (read_checkpoint(path, "radiance")[0] for path in (tmp_path / "new.safetensors", half.path))
