@@ -60,8 +60,7 @@ if TYPE_CHECKING:
     from .figures.scanpath import draw_scanpath
     from .formats.alignments import Alignment
     from .interop.scenes import export_scene
-    from .photos.images import load_photos
-    from .photos.posed import Photos
+    from .photos.photo_set import Photos
     from .reports.report import report
     from .surfaces.bake import bake
     from .surfaces.baked import draw_surface
@@ -92,7 +91,7 @@ _MODULES = {
     "Environment": "nerg_mi.environment.environment",
     "GazeField": "nerg_mi.environment.gaze",
     "NergError": "nerg_mi.errors",
-    "Photos": "nerg_mi.photos.posed",
+    "Photos": "nerg_mi.photos.photo_set",
     "RadianceField": "nerg_mi.environment.radiance",
     "Rays": "nerg_mi.tracking.rays",
     "Scene": "nerg_mi.environment.scene",
@@ -123,7 +122,6 @@ _MODULES = {
     "guess": "nerg_mi.tracking.imports",
     "import_checkpoint": "nerg_mi.environment.conversion",
     "import_rays": "nerg_mi.tracking.imports",
-    "load_photos": "nerg_mi.photos.images",
     "load_rays": "nerg_mi.tracking.dataset",
     "make_scene": "nerg_mi.environment.scene",
     "measure_events": "nerg_mi.tracking.measurement",
@@ -188,7 +186,6 @@ __all__ = [
     "guess",
     "import_checkpoint",
     "import_rays",
-    "load_photos",
     "load_rays",
     "make_scene",
     "measure_events",

@@ -18,7 +18,7 @@ from nerg_mi.formats.alignments import Alignment, read_similarity
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.options import parse_point
 from nerg_mi.photos.colmap import rotation_to_z
-from nerg_mi.photos.posed import Photos
+from nerg_mi.photos.photo_set import Photos
 from nerg_mi.progress import Progress, Reporter, open_reporter
 from nerg_mi.ranges import COORDINATES, LENGTHS, SEEDS, Range, check_ranges
 from nerg_mi.tracking.direction_checks import DECLARED

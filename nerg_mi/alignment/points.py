@@ -13,8 +13,8 @@ from nerg_mi.errors import NergError, parameter, sanitize
 from nerg_mi.files.safe_read import check_regular_file, read_json, translate_read_errors
 from nerg_mi.files.schema import NUMBER, Items, check_json
 from nerg_mi.files.values import FilePath
-from nerg_mi.photos.images import open_photos
-from nerg_mi.photos.posed import Photos, describe_unused
+from nerg_mi.photos.photo_set import Photos
+from nerg_mi.photos.posed import describe_unused
 from nerg_mi.tracking.readers.columns import open_named_table
 
 from .constraints import (
@@ -164,7 +164,7 @@ def read_cameras(tracking: Photos | FilePath, environment: Photos | FilePath) ->
 
     Raises `NergError` if there are fewer than two.
     """
-    models = [open_photos(photos) for photos in (tracking, environment)]
+    models = [Photos.open(photos) for photos in (tracking, environment)]
     for key in (_path_key, _name_key):
         tables = [_poses_by_name(model, key) for model in models]
         common = sorted(set(tables[0]) & set(tables[1]))

@@ -11,8 +11,9 @@ import numpy as np
 
 from nerg_mi.errors import NergError, parameter, sanitize
 from nerg_mi.maths.transforms import invert_similarity
-from nerg_mi.photos.images import load_photos, read_photo
-from nerg_mi.photos.posed import Photos, PosedFrame
+from nerg_mi.photos.images import read_photo
+from nerg_mi.photos.photo_set import Photos
+from nerg_mi.photos.posed import PosedFrame
 
 from .scene_writer import Lens, LookAt
 
@@ -47,7 +48,7 @@ def load_photo_cameras(
 
 
 def _posed(photos: Path, provenance: Mapping[str, Any], allow_outside: bool) -> Photos:
-    posed = load_photos(photos, allow_outside)
+    posed = Photos.load(photos, allow_outside)
     if "sha256" in provenance and provenance["sha256"] != posed.sha256:
         raise NergError(
             f'the field was not trained on "{posed.path}"; give the photos of its training with {parameter("photos")}'

@@ -14,7 +14,8 @@ from nerg_mi.files.tables import write_json
 from nerg_mi.files.values import FilePath, to_path
 from nerg_mi.photos.dataset import Dataset, PhotoView, open_dataset
 from nerg_mi.photos.images import pick_evenly
-from nerg_mi.photos.posed import Photos, describe_unused
+from nerg_mi.photos.photo_set import Photos
+from nerg_mi.photos.posed import describe_unused
 from nerg_mi.progress import Progress, Reporter, open_reporter
 from nerg_mi.ranges import LENGTHS, SPP, Range, check_ranges
 
@@ -54,7 +55,7 @@ def evaluate_radiance(
     field : RadianceField or path
         Radiance field (.safetensors).
     photos : Photos or path
-        Posed photos to compare with (`load_photos`), or their folder, its transforms.json, or a COLMAP model.
+        Posed photos to compare with, or their folder, its transforms.json, or a COLMAP model.
     train : bool
         Score the training views in place of the held-out views.
     views : int, optional

@@ -28,7 +28,7 @@ from nerg_mi.files.safe_read import (
 from nerg_mi.maths.transforms import ROTATION_TOLERANCE
 
 from .observed import MatchedImage, PointTable
-from .posed import MAX_POSITION, FileFinder, MaskFile, Photos, PosedFrame, UnusedFrame, format_names, sort_frames
+from .posed import MAX_POSITION, FileFinder, MaskFile, PosedFrame, PosedImages, UnusedFrame, format_names, sort_frames
 from .transforms import read_frame_poses
 
 # ---- COLMAP sparse models: ``cameras``, ``images`` and ``points3D``, as ``.bin`` or ``.txt`` ----
@@ -171,7 +171,7 @@ def read_colmap(
     masks: str | Path | None = None,
     allow_outside: bool = False,
     root: Path | None = None,
-) -> Photos:
+) -> PosedImages:
     """Read the COLMAP model in ``folder``, in its own world coordinates.
 
     Parameters
@@ -189,7 +189,7 @@ def read_colmap(
 
     Returns
     -------
-    Photos
+    PosedImages
         The frames. Frames that cannot be used are listed. A note reports a text file whose stated number of records
         differs from the actual one.
 
@@ -227,7 +227,9 @@ def read_colmap(
     notes = [] if binary else [n for k, c in counts.items() for n in _check_stated_count(files[k], c)]
     digest = _compute_digest(files)
     folders = frozenset([images, *(p for p in images.rglob("*") if p.is_dir())])
-    return Photos(files["images"], frames, unused, None, digest, notes, points, root, folders, frozenset(listed_images))
+    return PosedImages(
+        files["images"], frames, unused, None, digest, notes, points, root, folders, frozenset(listed_images)
+    )
 
 
 def count_images(folder: Path) -> int:
@@ -253,7 +255,7 @@ def read_image_poses(folder: str | Path) -> tuple[Path, str, list[tuple[str, np.
     path
         The file of images.
     sha256
-        Digest of the model, as in `Photos`.
+        Digest of the model, as in `PosedImages`.
     poses
         Name and OpenGL camera-to-world pose (4, 4) of each image.
     notes

@@ -36,7 +36,8 @@ from .background import measure_far_plane, remove_background
 from .cameras import PosedCamera, pixel_directions, project
 from .colmap import UpEstimate
 from .images import PhotoView, estimate_photo_up, load_usable_views, read_split
-from .posed import Photos, UnusedFrame
+from .photo_set import Photos
+from .posed import UnusedFrame
 
 # ---- Bounding box of a scene ----
 #
@@ -426,7 +427,7 @@ def open_dataset(
     Parameters
     ----------
     photos
-        Posed photos, or their file as in `load_photos`.
+        Posed photos, or their file as in `Photos.load`.
     holdout, coordinates, scale, allow_outside
         As in `read_split`.
     width

@@ -38,10 +38,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nerg_mi.errors import MissingFile, NergError, format_error, sanitize
+from nerg_mi.errors import NergError, format_error, sanitize
 from nerg_mi.files.images import check_image, read_exr
 from nerg_mi.files.safe_read import is_regular_file, read_npy, resolve_path, translate_read_errors
-from nerg_mi.files.values import FilePath, to_path
+from nerg_mi.files.values import FilePath
 from nerg_mi.maths.color import encode_srgb
 from nerg_mi.ranges import LENGTHS, check_number
 
@@ -57,17 +57,10 @@ from .cameras import (
     resize_mask,
     resize_nearest,
 )
-from .colmap import (
-    UpEstimate,
-    describe_other_models,
-    estimate_up,
-    find_pose_source,
-    read_colmap,
-    read_image_names,
-    rotation_to_z,
-)
+from .colmap import UpEstimate, estimate_up, rotation_to_z
 from .observed import ObservedPoints
-from .posed import DepthFile, MaskFile, Photos, PosedFrame, UnusedFrame, format_names
+from .photo_set import PHOTO_SUFFIXES, Photos
+from .posed import DepthFile, MaskFile, PosedFrame, PosedImages, UnusedFrame, format_names
 from .transforms import read_dataparser, read_transforms
 
 # ---- Images, depth and masks from files ----
@@ -453,8 +446,6 @@ def _load_distances(file: DepthFile, shape: tuple[int, int], intrinsics) -> np.n
 # ---- Files of a data set, and the split into training and held-out frames ----
 
 COORDINATES = ("file", "upright", "original")
-# Suffixes of photos, in lower case.
-_PHOTO_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr")
 # Suffixes of files that trainings write, possibly into the folder of the data set.
 _OUTPUT_SUFFIXES = (".safetensors", ".run", ".preview.png", ".curves.csv", ".curves.png")
 
@@ -478,59 +469,6 @@ class HoldoutSplit:
     rule: str
 
 
-def load_photos(path: FilePath, allow_outside: bool = False) -> Photos:
-    """Load posed photos: the poses and lenses of their cameras, and where their files are. Images are not read.
-
-    Parameters
-    ----------
-    path : path
-        Their folder, its transforms.json, or a COLMAP model.
-    allow_outside : bool
-        Whether files outside of the folder may be used. For a COLMAP model, this is the folder that contains its
-        images.
-
-    Returns
-    -------
-    Photos
-        The photos, for `train_radiance`, `evaluate_radiance` and `align`.
-
-    Raises
-    ------
-    NergError
-        The file does not exist or is damaged, or none of its frames can be used.
-
-    Examples
-    --------
-    >>> import nerg_mi as nerg
-    >>> loaded = nerg.load_photos(photos)  # photos: a folder of posed photos
-    >>> len(loaded) == len(loaded.centers)
-    True
-    """
-    source = find_pose_source(to_path(path))
-    if source.is_file():
-        return read_transforms(source, allow_outside)
-    folders = [source, *list(resolve_path(source).parents)[:3]]
-    images = next((f / "images" for f in folders if (f / "images").is_dir()), None)
-    root, notes = None, describe_other_models(source)
-    if images is None or not any(p.suffix.lower() in _PHOTO_SUFFIXES for p in images.rglob("*")):
-        names = read_image_names(source)
-        root = next((f for f in folders if any(is_regular_file(f / name, "image") for name in names)), None)
-        if root is not None:
-            images, notes = root, [*notes, f'the photos are in "{sanitize(root)}", and not in a folder "images"']
-    if images is None:
-        raise MissingFile(
-            f'there is no folder "images" next to or above the COLMAP model "{source}"; put the photos there'
-        )
-    masks = (root or images.parent) / "masks"
-    posed = read_colmap(source, images, masks if masks.is_dir() else None, allow_outside, root)
-    return replace(posed, notes=[*posed.notes, *notes])
-
-
-def open_photos(photos: Photos | FilePath, allow_outside: bool = False) -> Photos:
-    """Return photos unchanged, or load them from their file, as `load_photos` does."""
-    return photos if isinstance(photos, Photos) else load_photos(photos, allow_outside)
-
-
 def read_split(
     dataset: Photos | FilePath,
     holdout: int | None = None,
@@ -543,7 +481,7 @@ def read_split(
     Parameters
     ----------
     dataset
-        The data set, as in `open_photos`.
+        The data set, as in `Photos.open`.
     holdout
         Hold out every n-th frame; 0: none. None: the frames of ``transforms_test.json`` or ``transforms_val.json`` next
         to the file, or the test frames that the file lists, or every 8th frame.
@@ -554,9 +492,9 @@ def read_split(
     scale
         Scale factor for all lengths, applied last.
     allow_outside
-        As in `load_photos`.
+        As in `Photos.load`.
     """
-    original = posed = open_photos(dataset, allow_outside)
+    original = posed = Photos.open(dataset, allow_outside)
     similarity = _choose_similarity(posed, coordinates, scale)
     posed = posed.transform(similarity)
     if posed.unassigned:
@@ -607,7 +545,7 @@ def estimate_photo_up(posed: Photos) -> UpEstimate:
     return estimate_up(np.stack([f.to_world for f in posed.frames]), points)
 
 
-def _describe_unused_files(sets: list[Photos]) -> list[str]:
+def _describe_unused_files(sets: list[PosedImages]) -> list[str]:
     """Describe photos and other files in the folder of a data set that the files of ``sets`` do not use."""
     resolve = cache(resolve_path)
     locate = lambda path: resolve(path.parent) / path.name
@@ -619,7 +557,7 @@ def _describe_unused_files(sets: list[Photos]) -> list[str]:
         p
         for folder in {resolve(folder) for posed in sets for folder in posed.image_folders if folder.is_dir()}
         for p in folder.iterdir()
-        if p.suffix.lower() in _PHOTO_SUFFIXES and not p.name.startswith((".", "dynamic_mask_"))
+        if p.suffix.lower() in PHOTO_SUFFIXES and not p.name.startswith((".", "dynamic_mask_"))
     } - auxiliary_files
     photos_without_pose, notes = sorted(photos - listed), []
     if photos_without_pose:

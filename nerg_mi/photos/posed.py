@@ -10,13 +10,11 @@ from collections.abc import Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 
 from nerg_mi.errors import NergError, parameter, sanitize
-from nerg_mi.files import html
-from nerg_mi.files.dataframes import make_dataframe
 from nerg_mi.files.safe_read import is_regular_file, read_line_blocks, resolve_path
 from nerg_mi.maths.coordinates import check_near_origin
 from nerg_mi.maths.transforms import check_rigid_transforms, nearest_rotation
@@ -260,17 +258,12 @@ def describe_unused(unused: Iterable[UnusedFrame]) -> list[str]:
     ]
 
 
-@dataclass(frozen=True, repr=False, eq=False)
-class Photos:
-    """Posed photos, as their file describes them (`load_photos`); frames are sorted by file name.
+AnyImages = TypeVar("AnyImages", bound="PosedImages")
 
-    >>> import nerg_mi as nerg
-    >>> loaded = nerg.load_photos(photos)  # photos: a folder of posed photos
-    >>> loaded
-    <Photos transforms.json: photos 4, cameras span 0.1 x 1.8 x 0.1 units>
-    >>> loaded.to_dataframe().shape
-    (4, 7)
-    """
+
+@dataclass(frozen=True, repr=False, eq=False)
+class PosedImages:
+    """A posed image set, as its file describes it; frames are sorted by file name."""
 
     # The file.
     path: Path
@@ -299,39 +292,7 @@ class Photos:
     # Similarity (4, 4) from these coordinates to those of the file.
     to_file: np.ndarray = field(default_factory=lambda: np.eye(4))
 
-    @property
-    def centers(self) -> np.ndarray:
-        """Positions of the cameras (N, 3), in the units of the file."""
-        return np.array([frame.to_world[:3, 3] for frame in self.frames], np.float64).reshape(-1, 3)
-
-    def to_dataframe(self, library: str | None = None) -> Any:
-        """Return a data frame with one row for each photo: its name, and the position and the viewing direction of its
-        camera. ``library`` is as in `make_dataframe`."""
-        axes = np.array([-frame.to_world[:3, 2] for frame in self.frames], np.float64).reshape(-1, 3)
-        columns: dict[str, Any] = {"photo": [frame.name for frame in self.frames]}
-        columns |= {name: self.centers[:, k] for k, name in enumerate("xyz")}
-        return make_dataframe({**columns, **{f"d{name}": axes[:, k] for k, name in enumerate("xyz")}}, library)
-
-    def _facts(self) -> list[tuple[str, str]]:
-        extent = " x ".join(f"{x:.3g}" for x in np.ptp(self.centers, axis=0))
-        rows = [("photos", f"{len(self.frames):,}"), ("cameras span", f"{extent} units")]
-        counts = {
-            "with depth": sum(frame.depth is not None for frame in self.frames),
-            "not used": len(self.unused),
-            "surface points": 0 if self.points is None else len(self.points),
-        }
-        return rows + [(name, f"{count:,}") for name, count in counts.items() if count]
-
-    def __len__(self) -> int:
-        return len(self.frames)
-
-    def __repr__(self) -> str:
-        return f"<Photos {self.path.name}: {', '.join(f'{name} {value}' for name, value in self._facts())}>"
-
-    def _repr_html_(self) -> str:
-        return html.key_value_table([("file", self.path.name), *self._facts()])
-
-    def transform(self, similarity: np.ndarray) -> Photos:
+    def transform(self: AnyImages, similarity: np.ndarray) -> AnyImages:
         """Transform to other coordinates by ``similarity`` (4, 4): a uniform scale, a rotation and a translation."""
         scale, rotation = _split_similarity(similarity)
         back = np.linalg.inv(similarity)

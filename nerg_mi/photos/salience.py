@@ -18,8 +18,9 @@ from nerg_mi.maths.transforms import invert_similarity
 
 from . import cameras
 from .cameras import Intrinsics, PosedCamera, make_area_weights, resize_by_area, resize_mask, resize_nearest
-from .images import open_bitmap, open_photos, read_mask, read_photo
-from .posed import MaskFile, Photos, PosedFrame, check_inside, describe_unused
+from .images import open_bitmap, read_mask, read_photo
+from .photo_set import Photos
+from .posed import MaskFile, PosedFrame, check_inside, describe_unused
 
 # ---- Solid angles of pixels for any lens ----
 #
@@ -245,7 +246,7 @@ def open_salience(
     Parameters
     ----------
     dataset
-        The posed photos, or their file as in `load_photos`.
+        The posed photos, or their file as in `Photos.load`.
     source
         Folder with one .png, .exr or .npy per frame, with the name of the photo except for the suffix; or the name of a
         model (``SALIENCE_MODELS``), which computes the maps from the photos.
@@ -271,7 +272,7 @@ def open_salience(
     """
     if per not in VALUE_UNITS:
         raise NergError(f'per must be {" or ".join(VALUE_UNITS)}, got "{per}"')
-    posed = open_photos(dataset, allow_outside)
+    posed = Photos.open(dataset, allow_outside)
     if (
         align is None
         and field_provenance

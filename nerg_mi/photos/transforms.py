@@ -39,8 +39,8 @@ from .posed import (
     DepthFile,
     FileFinder,
     MaskFile,
-    Photos,
     PosedFrame,
+    PosedImages,
     UnusedFrame,
     check_inside,
     format_names,
@@ -99,7 +99,7 @@ _HARMLESS_VALUES = {"opengl", "nerfstudio", "nerf", "blender", "c2w", "camera_to
 _HARMLESS_VALUES |= {"perspective", "pinhole", "srgb"}
 
 
-def read_transforms(path: str | Path, allow_outside: bool = False) -> Photos:
+def read_transforms(path: str | Path, allow_outside: bool = False) -> PosedImages:
     """Read a transforms file. Frames that cannot be used are listed.
 
     ``allow_outside``: whether images, masks and depth files outside of the folder of the file may be used, after links
@@ -140,7 +140,7 @@ def read_transforms(path: str | Path, allow_outside: bool = False) -> Photos:
         notes.append(f'{len(moved)} photos are not where {path.name} states, but in "{folder}", and used from there')
     if unused_keys:
         notes.append(f"unused keys of {path.name}: {format_names(sorted(unused_keys), 12)}")
-    return Photos(
+    return PosedImages(
         path,
         frames,
         unused,

@@ -17,7 +17,8 @@ from nerg_mi.files.values import FilePath, to_path
 from nerg_mi.formats.fields import save_radiance
 from nerg_mi.interruption import TrainingInterrupted
 from nerg_mi.photos.dataset import Dataset, open_dataset
-from nerg_mi.photos.posed import Photos, describe_unused
+from nerg_mi.photos.photo_set import Photos
+from nerg_mi.photos.posed import describe_unused
 from nerg_mi.progress import Progress, Reporter, duration, open_reporter
 from nerg_mi.ranges import LENGTHS, MINUTES, SECONDS, SEEDS, STEPS, Range, check_ranges
 
@@ -64,7 +65,7 @@ def train_radiance(
     Parameters
     ----------
     photos : Photos or path
-        Posed photos (`load_photos`), or their folder, its transforms.json, or a COLMAP model.
+        Posed photos, or their folder, its transforms.json, or a COLMAP model.
     minutes : float, optional
         Training time in minutes. Default: 5, unless ``steps`` is given.
     steps : int, optional

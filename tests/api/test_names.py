@@ -94,7 +94,7 @@ def test_objects_and_results_have_the_same_methods():
     # That of a dataclass would list all values; the one of a camera is the call that makes it.
     assert {n for n, kind in kinds.items() if is_dataclass(kind) and kind.__dataclass_params__.repr} == {"Camera"}
     files = {"Alignment", "Areas", "DensityGrid", "Environment", "GazeField", "RadianceField", "Rays", "Scene"}
-    assert names_with("load", "open") == files | {"RayDataset", "WrittenScene"}
+    assert names_with("load", "open") == files | {"Photos", "RayDataset", "WrittenScene"}
     # Others are in memory only, or written by the function that returns them.
     results = {"Bake", "SplatBake", "ImportedFields", "MeasuredEvents", "RaysSplit", "Report", "StatisticsResult"}
     results |= {"StudyResult", "Surface", "SurfaceSplats", "TorchNgpModel"}

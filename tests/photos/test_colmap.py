@@ -25,7 +25,7 @@ from nerg_mi.photos.colmap import (
     read_named_poses,
     rotation_to_z,
 )
-from nerg_mi.photos.images import load_photos
+from nerg_mi.photos.photo_set import Photos
 from nerg_mi.photos.transforms import read_transforms
 
 # ---- COLMAP models, written byte by byte and line by line: cameras, poses, points, and invalid files ----
@@ -260,7 +260,7 @@ def test_photos_next_to_a_model_are_used_and_reported(model, folder, has_images)
         child.rename(root / folder / child.name)
     if not has_images:
         images.rmdir()
-    posed = load_photos(model)
+    posed = Photos.load(model)
     assert len(posed.frames) == 9 and posed.frames[0].image.is_relative_to(root / folder)
     assert posed.root == root / folder and any("photos are in" in note for note in posed.notes)
 

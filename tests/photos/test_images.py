@@ -15,11 +15,9 @@ from nerg_mi.photos.dataset import open_dataset
 from nerg_mi.photos.images import (
     PhotoView,
     apply_lens,
-    load_photos,
     load_usable_views,
     load_view,
     make_pinhole_camera,
-    open_photos,
     read_depth,
     read_image,
     read_mask,
@@ -28,6 +26,7 @@ from nerg_mi.photos.images import (
     split_holdout,
     undistort_photo,
 )
+from nerg_mi.photos.photo_set import Photos
 from nerg_mi.photos.posed import DepthFile, MaskFile, PosedFrame
 from nerg_mi.photos.transforms import read_transforms
 from tests.photos.written_sets import (
@@ -117,8 +116,8 @@ def test_invalid_depth_error_names_file(dataset):
 
 
 def test_photos_are_objects(ring):
-    loaded = load_photos(ring)
-    assert open_photos(loaded) is loaded and len(loaded) == COUNT
+    loaded = Photos.load(ring)
+    assert Photos.open(loaded) is loaded and len(loaded) == COUNT
     frame = loaded.to_dataframe("pandas")
     assert frame["photo"].tolist() == [f.name for f in loaded.frames]
     poses = np.stack([f.to_world for f in loaded.frames])
