@@ -278,7 +278,7 @@ class SpellingReporter:
         self._reporter.progress(fraction, clean_text(text))
 
 
-Progress: TypeAlias = "bool | Reporter | None"
+Progress: TypeAlias = bool | Reporter | None
 """Argument of functions. None shows a progress bar in notebooks, True shows one anywhere, and False none. Warnings
 become those of Python where there is no bar. A `Reporter` receives everything."""
 

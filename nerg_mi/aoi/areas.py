@@ -102,9 +102,6 @@ class AreaGroup:
 
 Area: TypeAlias = Region | MeshPart | SceneShape | AreaGroup
 
-AnyAreas: TypeAlias = "Areas | Mapping[str, Any]"
-"""Areas in memory, or a dict of them by name."""
-
 _KINDS = {Region: "box", MeshPart: "mesh", SceneShape: "shape", AreaGroup: "group"}
 
 
@@ -304,6 +301,10 @@ class Areas:
 
     def _repr_html_(self) -> str:
         return rows_to_html(self.list_rows())
+
+
+AnyAreas: TypeAlias = Areas | Mapping[str, Any]
+"""Areas in memory, or a dict of them by name."""
 
 
 def _resolve_group(

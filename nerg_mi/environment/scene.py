@@ -9,7 +9,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias, cast
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,8 +23,10 @@ from nerg_mi.files.values import FilePath, to_numbers
 from nerg_mi.formats.meshes import READERS as MESHES
 from nerg_mi.formats.splats import is_splat_file
 from nerg_mi.maths.geometry import Similarity
+from nerg_mi.maths.types import Axes, Figure, MitsubaScene, Sensor
 from nerg_mi.registration import get_plugin_class
-from nerg_mi.transport.geometry import check_shape
+from nerg_mi.transport.geometry import SceneGeometry, check_shape
+from nerg_mi.transport.observer import ObserverSettings
 
 from .arrays import Camera, Floats, as_points, join_names
 from .bands import is_nerg
@@ -44,14 +46,6 @@ from .nested_scene import make_paths_absolute, read_scene_elements, to_verbatim
 from .scene_loading import activate_mitsuba, load_scene
 from .scene_writer import check_attribute, compute_clip_distances, format_document
 from .trained import TrainedField
-
-if TYPE_CHECKING:
-    import mitsuba as mi
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-    from nerg_mi.transport.geometry import SceneGeometry
-    from nerg_mi.transport.observer import ObserverSettings
 
 COLOR = "color"
 """Name of the linear colour, the only quantity that is not an AOV."""
@@ -102,7 +96,7 @@ class Scene:
     [4.4 2.8 1.6]
     """
 
-    def __init__(self, mitsuba: mi.Scene):
+    def __init__(self, mitsuba: MitsubaScene):
         if type(mitsuba).__name__ != "Scene":
             raise NergError(
                 f'a scene must be a Mitsuba scene, not a {type(mitsuba).__name__}; use {{"type": "scene", ...}}'
@@ -163,7 +157,7 @@ class Scene:
             )
 
     @classmethod
-    def coerce(cls, scene: Scene | FilePath | mi.Scene | Mapping[str, Any]) -> Scene:
+    def coerce(cls, scene: Scene | FilePath | MitsubaScene | Mapping[str, Any]) -> Scene:
         """Return ``scene`` as a `Scene`: a scene file or a dict is loaded, and a Mitsuba scene is wrapped.
 
         Raises `NergError`.
@@ -176,7 +170,7 @@ class Scene:
         activate_mitsuba()
         # Each variant has a class of this name.
         if type(scene).__name__ == "Scene" and type(scene).__module__.partition(".")[0] == "mitsuba":
-            return cls(cast("mi.Scene", scene))
+            return cls(cast("MitsubaScene", scene))
         if isinstance(scene, Mapping):
             return cls._from_content(dict(scene))
         raise NergError(
@@ -356,7 +350,7 @@ class Scene:
         """The quantities to compute if none are requested."""
         return (COLOR, "depth", "opacity", *(("gaze", "visibility") if self.has_gaze else ()))
 
-    def resolve_sensor(self, camera: Camera | int | mi.Sensor | None = None) -> mi.Sensor:
+    def resolve_sensor(self, camera: Camera | int | Sensor | None = None) -> Sensor:
         """Return a sensor for ``camera``.
 
         Parameters
@@ -389,7 +383,7 @@ class Scene:
             raise NergError(f"there is no camera {number}, the scene has {available}; pass camera=Camera(...)")
         return sensors[number]
 
-    def _fit_clip_distances(self, sensor: mi.Sensor, camera: Camera) -> mi.Sensor:
+    def _fit_clip_distances(self, sensor: Sensor, camera: Camera) -> Sensor:
         """Extend the clip distances of the ``sensor`` of ``camera`` to the extent of the scene."""
         import mitsuba as mi
 
@@ -425,7 +419,7 @@ def make_scene(
     gaze: FilePath | TrainedField[GazeNetwork] | None = None,
     *,
     shapes: object = None,
-    camera: Camera | Mapping[str, Any] | mi.Sensor | None = None,
+    camera: Camera | Mapping[str, Any] | Sensor | None = None,
     observer: ArrayLike | None = None,
     to_world: ArrayLike | None = None,
     **settings: Any,

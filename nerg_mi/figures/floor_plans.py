@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from nerg_mi.environment.bands import SURFACE_OPACITY
 from nerg_mi.environment.scene import Scene
 from nerg_mi.errors import NergError, parameter
 from nerg_mi.files.values import FilePath, find_names
+from nerg_mi.maths.types import Axes, Figure, MitsubaScene
 from nerg_mi.progress import Progress, open_reporter
 from nerg_mi.ranges import COORDINATES, LENGTHS, Range, check_ranges
 from nerg_mi.tracking.dataset import open_rays
@@ -30,11 +31,6 @@ from .style import (
     save,
     show_figure,
 )
-
-if TYPE_CHECKING:
-    import mitsuba as mi
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 
 @check_ranges
@@ -119,7 +115,7 @@ def draw_floor(
     rays: Rays | FilePath,
     output: FilePath | None = None,
     *,
-    scene: FilePath | Scene | mi.Scene | None = None,
+    scene: FilePath | Scene | MitsubaScene | None = None,
     defaults: Mapping[str, str] | None = None,
     persons: Sequence[str] = (),
     paths: bool = True,

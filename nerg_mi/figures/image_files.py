@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from nerg_mi.environment.scene_loading import activate_mitsuba
 from nerg_mi.errors import MissingFile, NergError, parameter
 from nerg_mi.files.images import read_exr, read_exr_attributes
 from nerg_mi.files.values import FilePath, to_path
+from nerg_mi.maths.types import Figure
 from nerg_mi.photos.images import read_image
 from nerg_mi.progress import Progress, Reporter, open_reporter
 from nerg_mi.ranges import POSITIVE_VALUES, Range, check_ranges
@@ -21,9 +22,6 @@ from nerg_mi.ranges import POSITIVE_VALUES, Range, check_ranges
 from .overlay import Overlay, OverlayLayers, difference_figure, find_channel_overlay, shared_limits, srgb
 from .settings import Style
 from .style import changed_arguments, check_figure, contact_sheet, finish_figure, shrink
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 EXR = ".exr"
 

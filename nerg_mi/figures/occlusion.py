@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from nerg_mi.environment.scene_writer import project_to_pixel
 from nerg_mi.environment.sensors import copy_sampler, make_film, make_observer_camera, upright_pose, warn_observer
 from nerg_mi.errors import NergError
 from nerg_mi.files.values import FilePath
+from nerg_mi.maths.types import Figure, MitsubaScene
 from nerg_mi.progress import Progress, open_reporter
 from nerg_mi.ranges import POSITIVE_VALUES, SEEDS, SPP, Range, check_ranges
 from nerg_mi.transport.geometry import pixel_solid_angles
@@ -24,14 +25,10 @@ from .settings import Style
 from .sphere import sphere_figure
 from .style import changed_arguments, check_figure, finish_figure
 
-if TYPE_CHECKING:
-    import mitsuba as mi
-    from matplotlib.figure import Figure
-
 
 @check_ranges
 def draw_sphere(
-    scene: FilePath | Scene | mi.Scene,
+    scene: FilePath | Scene | MitsubaScene,
     output: FilePath | None = None,
     *,
     defaults: Mapping[str, str] | None = None,
@@ -128,7 +125,7 @@ def _make_panorama(observer: Any, camera: Any, width: int) -> Any:
 
 @check_ranges
 def draw_triptych(
-    scene: FilePath | Scene | mi.Scene,
+    scene: FilePath | Scene | MitsubaScene,
     output: FilePath | None = None,
     *,
     defaults: Mapping[str, str] | None = None,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,16 +17,11 @@ from nerg_mi.environment.scene_loading import activate_mitsuba
 from nerg_mi.errors import NergError, translate_mitsuba_errors
 from nerg_mi.files.html import image, markup, paragraph
 from nerg_mi.files.values import FilePath
+from nerg_mi.maths.types import Axes, Figure, Sensor
 from nerg_mi.progress import Progress, Reporter, open_reporter
 from nerg_mi.ranges import SEEDS, SPP, Range, check_number
 
 from .style import show_figure
-
-if TYPE_CHECKING:
-    import mitsuba as mi
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
 
 AXES = ("observer", "row", "column")
 
@@ -114,7 +109,7 @@ def render(
     observers: ArrayLike | None = None,
     quantities: str | Sequence[str] | None = None,
     *,
-    camera: Camera | int | mi.Sensor | None = None,
+    camera: Camera | int | Sensor | None = None,
     spp: int = 0,
     seed: int = 0,
     progress: Progress = None,

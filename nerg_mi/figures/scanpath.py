@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,7 +13,7 @@ from nerg_mi.environment.scene import Scene
 from nerg_mi.environment.scene_writer import project_to_pixel
 from nerg_mi.errors import NergError, parameter
 from nerg_mi.files.values import FilePath
-from nerg_mi.maths.types import variant_types
+from nerg_mi.maths.types import Figure, MitsubaScene, variant_types
 from nerg_mi.progress import Progress, open_reporter
 from nerg_mi.ranges import SEEDS, SPP, TIMES, Range, check_ranges
 from nerg_mi.tracking.dataset import open_rays
@@ -30,10 +30,6 @@ from .maps import participant_color
 from .overlay import find_overlay, srgb
 from .scene_views import find_camera, list_files, name_scene, open_scene, report_views
 from .style import INK, PAPER, SMALL, Sheet, changed_arguments, check_figure, existing_files, finish_figure
-
-if TYPE_CHECKING:
-    import mitsuba as mi
-    from matplotlib.figure import Figure
 
 _AREA = 420.0  # points² of the circle of a fixation of one second
 _MIN_AREA = 60.0
@@ -118,7 +114,7 @@ def scanpath_figure(
 @check_ranges
 def draw_scanpath(
     rays: Rays | FilePath,
-    scene: FilePath | Scene | mi.Scene,
+    scene: FilePath | Scene | MitsubaScene,
     output: FilePath | None = None,
     *,
     defaults: Mapping[str, str] | None = None,

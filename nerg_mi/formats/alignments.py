@@ -169,7 +169,7 @@ class Alignment:
         write_json(path, data, allow_nan=False)
 
 
-AnySimilarity: TypeAlias = "Alignment | Similarity | ArrayLike"
+AnySimilarity: TypeAlias = Alignment | Similarity | ArrayLike
 """A similarity transform in memory: an alignment, or a matrix (4, 4)."""
 
 

@@ -1,8 +1,10 @@
-"""Array types for annotations.
+"""Types for annotations: arrays, and classes of libraries that are loaded on first use.
 
 The class of an array is decided at run time: by the backend (LLVM or CUDA) of a field, or by Mitsuba's variant.
 Functions derive it from their arguments. These classes represent all of them for type checkers, and are `Any` at run
 time. Each array holds one value per lane; an array with a single lane is broadcast.
+
+Classes of Mitsuba and Matplotlib are `Any` at run time, too, so that `typing.get_type_hints` loads no library.
 """
 
 from __future__ import annotations
@@ -13,6 +15,10 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from drjit import ArrayBase
+    from matplotlib.axes import Axes as Axes
+    from matplotlib.figure import Figure as Figure
+    from mitsuba import Scene as MitsubaScene
+    from mitsuba import Sensor as Sensor
 
     class Bool(ArrayBase["Bool", "Bool | bool", bool, bool, "Bool", "Bool", "Bool"]):
         """Mask; a Python bool is accepted."""
@@ -43,6 +49,7 @@ if TYPE_CHECKING:
         wavelengths: Any
 else:
     Bool = Float = UInt32 = Array3f = Ray3f = Any
+    Axes = Figure = MitsubaScene = Sensor = Any
 
 Point3f: TypeAlias = Array3f  # Position, in the frame that the signature names
 

@@ -6,7 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 
@@ -21,15 +21,13 @@ from nerg_mi.formats.meshes import read_mesh_file
 from nerg_mi.formats.ply import parse_ply
 from nerg_mi.formats.splats import is_splat_file
 from nerg_mi.maths.arrays import to_vector
+from nerg_mi.maths.types import Figure
 from nerg_mi.progress import Progress, open_reporter
 from nerg_mi.ranges import COORDINATES, POSITIVE_VALUES, Range, check_ranges
 from nerg_mi.transport.mitsuba_mesh import make_mesh
 
 from .bake import Bake
 from .mesh import Mesh
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _HEADER = 1 << 16
 _BARE, _LIT, _PAPER = 0.18, 0.3, 1.0

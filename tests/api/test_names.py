@@ -10,6 +10,7 @@ import subprocess
 import sys
 from dataclasses import is_dataclass
 from importlib.resources import files
+from typing import get_type_hints
 
 import numpy as np
 import pytest
@@ -59,6 +60,12 @@ def test04_unknown_names_are_attribute_errors():
 def test05_types_are_resolved(name):
     value = getattr(nerg, name)
     assert value.__doc__ and value.__name__ == name
+    get_type_hints(value)
+    for kind in value.__mro__[:-1] if inspect.isclass(value) else ():
+        for method in (m for n, m in vars(kind).items() if not n.startswith("_")):
+            function = getattr(method, "__func__", getattr(method, "fget", method))
+            if inspect.isfunction(function):
+                get_type_hints(function)
     if inspect.isfunction(value):
         signature = inspect.signature(value)
         assert signature.return_annotation is not inspect.Signature.empty
