@@ -10,7 +10,7 @@ from dataclasses import field
 from typing import Any
 
 from nerg_mi.errors import NergError, sanitize
-from nerg_mi.ranges import CHANGES_RESULT, COORDINATES, FLAG, RANGE, THREADS, Range, check_number
+from nerg_mi.ranges import CHANGES_RESULT, COORDINATES, IS_OPTION, RANGE, THREADS, Range, check_number
 
 MAIN, INPUT, VIEW, MODEL, TRAINING, TEST = "Main", "Input", "View", "Model", "Training", "Test"
 ANALYSIS, OUTPUT, PERFORMANCE = "Analysis", "Output", "Performance"
@@ -54,7 +54,7 @@ def option(
         Further parameters of ``typer.Option``, such as ``metavar``.
     """
     metadata = {"help": help, "names": names, "parse": parse, "more": {**more, PANEL: group}}
-    metadata |= {CHANGES_RESULT: changes_result, RANGE: within, FLAG: names[-1] if names else ""}
+    metadata |= {CHANGES_RESULT: changes_result, RANGE: within, IS_OPTION: True}
     return field(default=default, metadata=metadata)
 
 

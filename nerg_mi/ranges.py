@@ -16,9 +16,9 @@ from typing import Any, TypeVar, cast, get_args, get_type_hints
 
 from nerg_mi.errors import NergError, parameter, sanitize
 
-RANGE, FLAG = "nerg_mi.range", "nerg_mi.flag"
-"""Keys in the metadata of a dataclass field: the `Range` of its value, and its spelling on the command line. An empty
-spelling means that the option is spelled as the field. A field without the key is not a command-line option."""
+RANGE, IS_OPTION = "nerg_mi.range", "nerg_mi.is_option"
+"""Keys in the metadata of a dataclass field: the `Range` of its value, and whether it is a command-line option of its
+own, which messages spell as one."""
 
 CHANGES_RESULT = "nerg_mi.changes_result"
 """Key in the same metadata: False for a field that affects where or how a result is computed, but not the result."""
@@ -271,7 +271,7 @@ class ValidatedDataclass:
 
 def _describe_field(field: dataclasses.Field) -> str:
     """Return the name of ``field`` in error messages."""
-    return parameter(field.name) if FLAG in field.metadata else field.name
+    return parameter(field.name) if field.metadata.get(IS_OPTION) else field.name
 
 
 def _format_value(value: Any) -> str:

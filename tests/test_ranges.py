@@ -30,7 +30,6 @@ from nerg_mi.formats.surfaces import write_volume
 from nerg_mi.maths import vmf
 from nerg_mi.photos.cameras import Intrinsics, PosedCamera
 from nerg_mi.ranges import (
-    FLAG,
     KAPPAS,
     MAX_COORDINATE,
     RANGE,
@@ -127,7 +126,7 @@ def test_command_line_refuses_the_same_values(kind):
     take = lambda options, reporter: made.append(options)
     run = build_command(Command("take", take, "", "", kind, left_out, {}))
     for field in _numbers(kind):
-        flag = field.metadata[FLAG] or "--" + field.name.replace("_", "-")
+        flag = (field.metadata["names"] or ["--" + field.name.replace("_", "-")])[-1]
         for value in ("nan", "1e400", "1" + 400 * "0"):
             text = ",".join([value] * 3) if field.metadata["parse"] else value
             with pytest.raises((NergError, typer.BadParameter)):

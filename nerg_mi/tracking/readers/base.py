@@ -20,7 +20,7 @@ from nerg_mi.files.atomic import file_sha256
 from nerg_mi.files.safe_read import BadLineCallback, check_regular_file
 from nerg_mi.files.values import normalize_name, to_name
 from nerg_mi.maths.coordinates import check_near_origin
-from nerg_mi.ranges import FLAG, MAX_COORDINATE, RANGE, TIME_UNITS, Range, ValidatedDataclass
+from nerg_mi.ranges import IS_OPTION, MAX_COORDINATE, RANGE, TIME_UNITS, Range, ValidatedDataclass
 from nerg_mi.tracking.rays import COLUMNS, FRAME, Rays, merge_tracking
 
 from .cells import MISSING_WORDS
@@ -574,8 +574,8 @@ def option(
         False for values that the metadata of rays contain in another form, such as the frame.
     """
     spec = {"help": help, "flag": flag, "default_text": default_text, "parse": parse, "is_recorded": is_recorded}
-    exposed = {} if flag == "" else {FLAG: flag or ""}
-    return dataclasses.field(default=default, metadata={_OPTION_KEY: spec, RANGE: within, **exposed})
+    metadata = {_OPTION_KEY: spec, RANGE: within, IS_OPTION: flag != ""}
+    return dataclasses.field(default=default, metadata=metadata)
 
 
 def tick_option(default: float = 1.0) -> Any:
