@@ -14,7 +14,7 @@ from nerg_mi.environment.gaze import GazeField
 from nerg_mi.environment.planned import PlannedFiles
 from nerg_mi.environment.scene import AnyEnvironment
 from nerg_mi.errors import NergError, parameter
-from nerg_mi.files.atomic import check_folder, write_text
+from nerg_mi.files.atomic import check_folder, make_folder, write_text
 from nerg_mi.files.dataframes import ResultTables
 from nerg_mi.files.safe_read import read_json
 from nerg_mi.files.tables import add_notes, write_csv, write_json
@@ -66,6 +66,8 @@ class FoldResult(ResultTables):
         How well a signal ranks the errors of all positions, for each split and for all of them ("anywhere").
     calibration
         One row per split and method: means over folds.
+    held_out
+        What each fold holds out, in words.
     """
 
     TABLES = ("rows", "each", "by_position", "uncertainty", "calibration")
@@ -77,6 +79,31 @@ class FoldResult(ResultTables):
     by_position: list[dict[str, Any]]
     uncertainty: list[dict[str, Any]]
     calibration: list[dict[str, Any]]
+    held_out: str
+
+    def save(self, folder: FilePath) -> list[Path]:
+        """Write folds.md, folds.csv (by fold), positions.csv (by position) and folds.json to ``folder``, and return
+        their paths. Raises `NergError` if they cannot be written."""
+        folder, folds = make_folder(to_path(folder)), len(self.fields)
+        files = [folder / name for name in ("folds.md", "folds.csv", "positions.csv", "folds.json")]
+        text = (
+            f"# {folds} folds\n\nEach fold holds out {self.held_out}. Means over folds; brackets: 95 % confidence "
+            f"intervals of Student's t for {folds} folds, which share training participants: the spread over what was "
+            "held out. The last row of each table is the mean difference over folds. Ranks of errors by uncertainty "
+            "use the positions of all folds, with 95 % bootstrap intervals over zones.\n"
+        )
+        select = lambda table, split: [row for row in table if row["split"] == split]
+        for split in dict.fromkeys(row["split"] for row in (*self.rows, *self.uncertainty)):
+            text += f"\n# {split}\n\n"
+            if selected := select(self.rows, split):
+                text += f"{format_table(selected, ('method', *SCORES, 'integral', 'folds'))}\n"
+            text += format_uncertainty(select(self.uncertainty, split), select(self.calibration, split))
+        write_text(files[0], text)
+        write_csv(files[1], self.each)
+        write_csv(files[2], self.by_position)
+        tables = {"methods": self.rows, "uncertainty": self.uncertainty, "calibration": self.calibration}
+        write_json(files[3], {"folds": folds, "seed": self.each[0]["fold"], **tables})
+        return files
 
 
 @dataclass(frozen=True)
@@ -247,12 +274,12 @@ def folds(
         else:
             show = lambda done: reporter.progress(done / folds, f"fold {done + 1} of {folds}")
             finished = _compute_folds(common, environment, seeds, show)
-        result = _summarise(finished, kinds, reporter)
+        held_out = (
+            f"{100 * test_participants:g} % of the participants, {test_positions} positions in {test_zones} zones"
+        )
+        result = _summarise(finished, kinds, held_out, reporter)
         if folder is not None:
-            test = (
-                f"{100 * test_participants:g} % of the participants, {test_positions} positions in {test_zones} zones"
-            )
-            result.files.extend(_write(folder, test, folds, seed, result))
+            result.files.extend(result.save(folder))
         for split in kinds:
             means = [row for row in result.rows if row["split"] == split]
             rows = [{k: row.get(k, math.nan) for k in ("method", *PRINTED)} for row in means]
@@ -365,9 +392,9 @@ def _plan_environment(environment: AnyEnvironment, folder: Path | None) -> Plann
 
 
 def _summarise(
-    finished: Iterator[tuple[int, GazeField, dict[str, Any]]], splits: Sequence[str], reporter: Reporter
+    finished: Iterator[tuple[int, GazeField, dict[str, Any]]], splits: Sequence[str], held_out: str, reporter: Reporter
 ) -> FoldResult:
-    """Return the tables of the folds: their seeds, fields, and tables by split."""
+    """Return the result of the folds: their seeds, fields, and tables by split."""
     by_split, regions = {split: [] for split in splits}, {split: [] for split in splits}
     each, fields, positions = [], [], []
     for seed, gaze, results in finished:
@@ -391,28 +418,4 @@ def _summarise(
     held = [{"split": split, **row} for split, scores in regions.items() for row in average_folds(scores, _LEVELS)]
     for table in (rows, each, positions, ranks, held):
         add_notes(table, explain_missing)
-    return FoldResult(rows, each, fields, [], positions, ranks, held)
-
-
-def _write(folder: Path, test: str, folds: int, seed: int, result: FoldResult) -> list[Path]:
-    """Write the tables; ``test`` says what each fold holds out."""
-    files = [folder / name for name in ("folds.md", "folds.csv", "positions.csv", "folds.json")]
-    text = (
-        f"# {folds} folds\n\nEach fold holds out {test}. Means over folds; brackets: 95 % confidence intervals of "
-        f"Student's t for {folds} folds, which share training participants: the spread over what was held out. The "
-        "last row of each table is the mean difference over folds. Ranks of errors by uncertainty use the positions of "
-        "all folds, with 95 % bootstrap intervals over zones.\n"
-    )
-    rows, ranks, regions = result.rows, result.uncertainty, result.calibration
-    select = lambda table, split: [row for row in table if row["split"] == split]
-    for split in dict.fromkeys(row["split"] for row in (*rows, *ranks)):
-        text += f"\n# {split}\n\n"
-        if selected := select(rows, split):
-            text += f"{format_table(selected, ('method', *SCORES, 'integral', 'folds'))}\n"
-        text += format_uncertainty(select(ranks, split), select(regions, split))
-    write_text(files[0], text)
-    write_csv(files[1], result.each)
-    write_csv(files[2], result.by_position)
-    tables = {"methods": rows, "uncertainty": ranks, "calibration": regions}
-    write_json(files[3], {"folds": folds, "seed": seed, **tables})
-    return files
+    return FoldResult(rows, each, fields, [], positions, ranks, held, held_out)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -14,7 +15,7 @@ from nerg_mi.environment.scene import AnyEnvironment
 from nerg_mi.errors import NergError, parameter
 from nerg_mi.fields.gaze_base import tracking_suffix
 from nerg_mi.figures.style import changed_arguments, existing_files, make_provenance
-from nerg_mi.files.atomic import check_folder, file_sha256
+from nerg_mi.files.atomic import check_folder, file_sha256, make_folder
 from nerg_mi.files.dataframes import ResultTables
 from nerg_mi.files.tables import add_notes
 from nerg_mi.files.values import FilePath, to_path
@@ -30,7 +31,7 @@ from nerg_mi.train.prior import ELEVATION_PRIOR
 from . import gaze as evaluation
 from .baselines import CONDITIONAL_KDE, NEAREST_RAYS, REAIMED_HITS, Baseline, format_settings, make_tuned_baselines
 from .baselines import PRIOR as PRIOR_BASELINE
-from .gaze import EPS, SCORES, CachedBaseline, FieldDensity
+from .gaze import EPS, SCORES, SPLIT_HALF, CachedBaseline, FieldDensity
 from .gaze_report import draw_comparison, explain_missing, write_report
 from .uncertainty import correlate_uncertainty, measure_calibration, score_positions
 
@@ -70,6 +71,38 @@ class GazeEvaluation(ResultTables):
     split_half_note: str = ""  # Why there is no row of the split half
     kappa: float = 20.0  # Concentration of the kernels of reference densities
     tracking: str = "unknown"  # What was tracked, of `nerg_mi.tracking.rays.TRACKING`
+    gaze: str = ""  # Name of the field, and the checksum of its file, if it has one
+    gaze_sha256: str | None = None
+    resamples: int = 0  # Resamples of the participants for confidence intervals
+    introduction: str = ""  # What the scores are, in Markdown
+    # Writes the figure of reference and predicted densities; None without one.
+    draw: Callable[[Path], None] | None = field(default=None, compare=False)
+
+    def save(self, folder: FilePath) -> list[Path]:
+        """Write tables and figures to ``folder``, and return their paths.
+
+        These are gaze.md, gaze.csv (by method), persons.csv (by participant), gaze.json, positions.csv (by position)
+        and, unless it was evaluated with ``pictures=0``, positions.png. Raises `NergError` if they cannot be written.
+        """
+        folder = make_folder(to_path(folder))
+        summary = {
+            "gaze": self.gaze,
+            **({} if self.gaze_sha256 is None else {"gaze_sha256": self.gaze_sha256}),
+            "tracking": self.tracking,
+            "split": self.split,
+            "kappa": self.kappa,
+            "positions": self.positions,
+            "people": self.people,
+            "resamples": self.resamples,
+            "split_half": next((row for row in self.rows if row["method"] == SPLIT_HALF), None),
+            "split_half_note": self.split_half_note,
+        }
+        tables = self.by_position, self.uncertainty, self.calibration
+        files = write_report(folder, self.rows, self.persons, summary, self.introduction, *tables)
+        if self.draw is not None:
+            self.draw(folder / "positions.png")
+            files.append(folder / "positions.png")
+        return files
 
 
 @check_ranges
@@ -210,6 +243,14 @@ def evaluate_gaze(
         regions = measure_calibration(test, calibrated, resamples, seed, {_FIELD: stored} if stored else None)
         for table in (rows, persons, places, ranks, regions):
             add_notes(table, explain_missing)
+        numbers = len(train), len(data), account["radius"], kappa, directions, resamples
+        notes = _notes(loaded.name, split, test, *numbers, half_note)
+
+        def draw(path: Path) -> None:
+            sources = existing_files(loaded.path, rays, opened.path)
+            record = make_provenance("nerg eval gaze", sources, seed, changed_arguments(evaluate_gaze, arguments))
+            draw_comparison(test, select(_DRAWN), path, pictures, provenance=record)
+
         result = GazeEvaluation(
             rows,
             persons,
@@ -223,30 +264,15 @@ def evaluate_gaze(
             half_note,
             kappa,
             tracking,
+            loaded.name,
+            None if loaded.path is None else file_sha256(loaded.path),
+            resamples,
+            f"{notes} Tracking: {TRACKING[tracking]}. {format_settings(baselines)}",
+            draw if pictures else None,
         )
         if folder is not None:
-            summary = {
-                "gaze": loaded.name,
-                **({} if loaded.path is None else {"gaze_sha256": file_sha256(loaded.path)}),
-                "tracking": tracking,
-                "split": split,
-                "kappa": kappa,
-                "positions": result.positions,
-                "people": result.people,
-                "resamples": resamples,
-                "split_half": half,
-                "split_half_note": half_note,
-            }
-            numbers = len(train), len(data), account["radius"], kappa, directions, resamples
-            notes = _notes(loaded.name, split, test, *numbers, half_note)
-            notes += f" Tracking: {TRACKING[tracking]}. {format_settings(baselines)}"
-            result.files.extend(write_report(folder, rows, persons, summary, notes, places, ranks, regions))
-            if pictures:
-                reporter.progress(0.95, "pictures")
-                result.files.append(folder / "positions.png")
-                sources = existing_files(loaded.path, rays, opened.path)
-                record = make_provenance("nerg eval gaze", sources, seed, changed_arguments(evaluate_gaze, arguments))
-                draw_comparison(test, select(_DRAWN), result.files[-1], pictures, provenance=record)
+            reporter.progress(0.95, "pictures")
+            result.files.extend(result.save(folder))
         _report(loaded, result, reporter)
     return result
 

@@ -17,8 +17,8 @@ from nerg_mi.figures.style import existing_files, make_provenance
 from nerg_mi.files.atomic import make_folder
 from nerg_mi.files.dataframes import ResultTables
 from nerg_mi.files.names import make_portable_names
-from nerg_mi.files.tables import add_notes
-from nerg_mi.files.values import FilePath
+from nerg_mi.files.tables import add_notes, write_json
+from nerg_mi.files.values import FilePath, to_path
 from nerg_mi.maths.arrays import check_weights
 from nerg_mi.maths.color import color_corrected_psnr, mean_ignoring_nan, psnr
 from nerg_mi.photos.cameras import PosedCamera, make_sensor_dict, pixel_directions
@@ -190,6 +190,9 @@ class ViewScores(ResultTables):
     depth: DepthScore | None
     # Names of those ``views`` that chose the state of the field; they have means of their own.
     validation: list[str] = field(default_factory=list)
+    # Names of the field and of the photos.
+    field_name: str = ""
+    dataset: str = ""
 
     @property
     def rows(self) -> list[dict]:
@@ -223,12 +226,17 @@ class ViewScores(ResultTables):
     def _compute_mean(self, scores: list[float], is_validation: bool = False) -> float:
         return mean_ignoring_nan([s for v, s in zip(self.views, scores) if (v in self.validation) == is_validation])
 
-    def to_dict(self) -> dict:
-        """Return the fields, means and notes on missing scores for JSON, without ``depth`` if it is None."""
-        names = ["views", "width", "height", "spp", "psnr", "psnr_mean", "ssim", "ssim_mean"]
+    def save(self, path: FilePath) -> Path:
+        """Write the scores, their means and notes on missing scores (.json), with the depth error if there is one.
+
+        Raises `NergError` if the file cannot be written.
+        """
+        names = ["dataset", "views", "width", "height", "spp", "psnr", "psnr_mean", "ssim", "ssim_mean"]
         names += ["psnr_fitted", "psnr_fitted_mean", "validation", "validation_means"]
-        out = {name: getattr(self, name) for name in names} | {"notes": [row["note"] for row in self.rows]}
-        return out if self.depth is None else out | {"depth": asdict(self.depth)}
+        out = {"field": self.field_name} | {name: getattr(self, name) for name in names}
+        out |= {"notes": [row["note"] for row in self.rows]}
+        write_json(to_path(path), out if self.depth is None else out | {"depth": asdict(self.depth)})
+        return to_path(path)
 
 
 def score_views(

@@ -14,7 +14,7 @@ from nerg_mi.environment.environment import Environment
 from nerg_mi.environment.gaze import GazeField
 from nerg_mi.environment.scene import AnyEnvironment
 from nerg_mi.errors import NergError, parameter
-from nerg_mi.files.atomic import check_folder, file_sha256, write_text
+from nerg_mi.files.atomic import check_folder, file_sha256, make_folder, write_text
 from nerg_mi.files.dataframes import ResultTables
 from nerg_mi.files.tables import add_notes, write_csv, write_json
 from nerg_mi.files.values import FilePath, to_path
@@ -70,6 +70,36 @@ class NextLookEvaluation(ResultTables):
     prior_kappa: float
     # Written tables and weights.
     files: list[Path]
+    gaze: str  # Name of the field, and the checksum of its file, if it has one
+    gaze_sha256: str | None
+
+    def save(self, folder: FilePath) -> list[Path]:
+        """Write next.md, next.csv (the scores) and next.json, which has the model, too, to ``folder``, and return their
+        paths. Raises `NergError` if they cannot be written."""
+        folder, model = make_folder(to_path(folder)), self.model
+        files = [folder / name for name in ("next.md", "next.csv", "next.json")]
+        weights = [
+            {"component": str(component), **{f"{t:g} s": float(w) for t, w in zip(model.knots, row)}}
+            for component, row in zip(model.components, model.weights.T)
+            if row.max() >= 0.01
+        ]
+        title = "the next look" if model.gaze_in_head is None else "gaze given the direction of the head"
+        notes = (
+            f"# {self.gaze}: {title}\n\nWeights fitted to {self.fitted} participants, scores of {self.scored} "
+            "others, at held-out positions; each zone of these is scored with weights from the other zones. Elapsed "
+            "times in seconds; bits per look above the position-independent prior with kappa "
+            f"{self.prior_kappa:g}; gap: bits of the first method above the method. Brackets: ± 1.96 standard errors "
+            "from resampled participants.\n\n"
+        )
+        table = format_table([{**row, "elapsed": f"{row['elapsed']:g} s"} for row in self.rows], _COLUMNS)
+        columns = tuple(weights[0])
+        write_text(files[0], f"{notes}{table}\n## Weights of at least 1 %\n\n{format_table(weights, columns)}")
+        write_csv(files[1], self.rows)
+        summary: dict[str, Any] = {"gaze": self.gaze, "fitted": self.fitted, "scored": self.scored}
+        if self.gaze_sha256 is not None:
+            summary["gaze_sha256"] = self.gaze_sha256
+        write_json(files[2], summary | {"prior_kappa": self.prior_kappa, "rows": self.rows, "model": model.to_json()})
+        return files
 
 
 @check_ranges
@@ -168,7 +198,7 @@ def next_look(
         opened = loaded.open_environment(environment)
         result = _evaluate(loaded, data, opened, knots, earlier, head, max_looks, resamples, seed, reporter)
         if folder is not None:
-            result = replace(result, files=_write(folder, loaded, result))
+            result = replace(result, files=result.save(folder))
         rows = [
             {"elapsed": f"{row['elapsed']:g} s", **{k: row.get(k, math.nan) for k in _COLUMNS[1:]}}
             for row in result.rows
@@ -246,7 +276,8 @@ def _evaluate(
         model, table = replace(model, gaze_in_head=gaze_in_head), [{**row, "elapsed": 0.0} for row in table]
     add_notes(table, explain_missing)
     people = [len(np.unique(sample.person)) for sample in samples]
-    return NextLookEvaluation(model, table, people[0], people[1], kappa, [])
+    sha256 = None if gaze.path is None else file_sha256(gaze.path)
+    return NextLookEvaluation(model, table, people[0], people[1], kappa, [], gaze.name, sha256)
 
 
 def _sample_looks(
@@ -299,30 +330,3 @@ def make_ray_distance(environment: Environment) -> RayDistance | None:
         return np.where(opacity >= SURFACE_OPACITY, depth / environment.align.scale, np.inf)
 
     return measure
-
-
-def _write(folder: Path, gaze: GazeField, result: NextLookEvaluation) -> list[Path]:
-    files = [folder / name for name in ("next.md", "next.csv", "next.json")]
-    weights = [
-        {"component": str(component), **{f"{t:g} s": float(w) for t, w in zip(result.model.knots, row)}}
-        for component, row in zip(result.model.components, result.model.weights.T)
-        if row.max() >= 0.01
-    ]
-    title = "the next look" if result.model.gaze_in_head is None else "gaze given the direction of the head"
-    notes = (
-        f"# {gaze.name}: {title}\n\nWeights fitted to {result.fitted} participants, scores of {result.scored} "
-        "others, at held-out positions; each zone of these is scored with weights from the other zones. Elapsed times "
-        "in seconds; bits per look above the position-independent prior with kappa "
-        f"{result.prior_kappa:g}; gap: bits of the first method above the method. Brackets: ± 1.96 standard errors "
-        "from resampled participants.\n\n"
-    )
-    table = format_table([{**row, "elapsed": f"{row['elapsed']:g} s"} for row in result.rows], _COLUMNS)
-    columns = tuple(weights[0])
-    write_text(files[0], f"{notes}{table}\n## Weights of at least 1 %\n\n{format_table(weights, columns)}")
-    write_csv(files[1], result.rows)
-    summary: dict[str, Any] = {"gaze": gaze.name, "fitted": result.fitted, "scored": result.scored}
-    if gaze.path is not None:
-        summary["gaze_sha256"] = file_sha256(gaze.path)
-    summary |= {"prior_kappa": result.prior_kappa, "rows": result.rows, "model": result.model.to_json()}
-    write_json(files[2], summary)
-    return files

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 from nerg_mi.environment.radiance import RadianceField, get_validation_views
 from nerg_mi.errors import NergError, parameter
 from nerg_mi.files.atomic import check_folder, check_writable
-from nerg_mi.files.tables import write_json
 from nerg_mi.files.values import FilePath, to_path
 from nerg_mi.photos.dataset import Dataset, PhotoView, open_dataset
 from nerg_mi.photos.images import pick_evenly
@@ -120,11 +120,11 @@ def evaluate_radiance(
         if views is not None:
             chosen = pick_evenly([view for view in chosen if view.name not in validation], views)
         scores = _score(loaded, chosen, validation, spp, pictures, reporter)
+        scores = replace(scores, field_name=loaded.name, dataset=data.source["dataset"])
         if pictures is not None:
             reporter.message(f"wrote {len(chosen)} images to {pictures}")
         if json is not None:
-            write_json(json, {"field": loaded.name, "dataset": data.source["dataset"]} | scores.to_dict())
-            reporter.message(f"wrote {json}")
+            reporter.message(f"wrote {scores.save(json)}")
     return scores
 
 

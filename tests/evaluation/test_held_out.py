@@ -79,13 +79,17 @@ def test_scores_are_listed_with_the_baselines(trained, tmp_path):
     assert "directions of equal area" in text and TRACKING[result.tracking] in text
 
 
-def test_without_an_output_folder_nothing_is_written(trained, monkeypatch):
+def test_without_an_output_folder_nothing_is_written(trained, tmp_path, monkeypatch):
     before, options, tune = set(trained.iterdir()), {}, held_out.make_tuned_baselines
     monkeypatch.setattr(held_out, "make_tuned_baselines", lambda *args, **k: options.update(k) or tune(*args, **k))
     rays = Rays.load(trained / "rays.npz").with_tracking("head")
     result = evaluate_gaze(trained / "gaze.safetensors", rays, **OPTIONS)
     assert result.tracking == "head"
     assert result.files == [] and set(trained.iterdir()) == before and result.rows[0]["method"] == "gaze field"
+    written = evaluate_gaze(trained / "gaze.safetensors", rays, **OPTIONS, output=tmp_path / "eval").files
+    saved = result.save(tmp_path / "saved")
+    assert [p.name for p in saved] == [p.name for p in written] and saved[-1].name == "positions.png"
+    assert all(a.read_bytes() == b.read_bytes() for a, b in zip(saved[:-1], written))
     # The folds of the baselines hold out what the test does.
     assert result.split == "pos" and (options["participants"], options["positions"]) == (False, True)
 
@@ -219,6 +223,8 @@ def test_two_workers_give_equal_scores_although_one_is_killed(equal_processes, t
     assert [f.read_bytes() for f in expected.files] == [f.read_bytes() for f in result.files]
     in_memory = folds(crowd(3000), "none", **SMALL | {"folds": 3})
     assert in_memory.rows == result.rows and in_memory.fields[0].path is None and not in_memory.files
+    saved = in_memory.save(tmp_path / "saved")
+    assert [f.read_bytes() for f in saved] == [f.read_bytes() for f in result.files]
 
 
 @pytest.fixture(autouse=True)
