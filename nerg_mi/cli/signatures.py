@@ -229,14 +229,20 @@ def _is_replaced(annotation: str) -> bool:
 
 
 def read_parameter_texts(function: Callable[..., Any]) -> dict[str, str]:
-    """Return the texts of the section Parameters of a docstring, by name, each as one line."""
+    """Return the texts of the section Parameters of a docstring, by name, each as one line.
+
+    "As for `FUNCTION`." stands for the texts of another function of the same module.
+    """
     _, _, section = (inspect.getdoc(function) or "").partition("\nParameters\n----------\n")
     entries = re.split(r"^(?=\S)", section.split("\n\n")[0], flags=re.M)
     texts: dict[str, str] = {}
     for entry in filter(None, entries):
         head, _, text = entry.partition("\n")
+        text = " ".join(text.split())
+        other = re.fullmatch(r"As for `(\w+)`\.", text)
+        shared = read_parameter_texts(read_signature(f"{function.__module__}:{other[1]}")) if other else {}
         for name in head.partition(" : ")[0].split(", "):
-            texts[name] = " ".join(text.split())
+            texts[name] = shared[name] if other else text
     return texts
 
 

@@ -244,18 +244,10 @@ def export_points(
 
     Parameters
     ----------
-    field : RadianceField or path
-        Radiance field (.safetensors).
-    resolution : int
-        Number of grid cells along the longest edge of the field's bounding box.
-    density_threshold : float, optional
-        Density of the extracted surface in 1/unit. Default: absorbs half of the light across a grid cell.
+    field, resolution, density_threshold, up, progress
+        As for `export_mesh`.
     max_points : int, optional
         Maximum number of points; if there are more, a random selection is kept. Default: all.
-    up : str
-        Up axis of the field, z or y. It is turned to +y in .glb files.
-    progress : bool, Reporter or None
-        Progress and messages (`nerg_mi.progress.Progress`).
 
     Returns
     -------
@@ -293,14 +285,8 @@ def export_splats(
 
     Parameters
     ----------
-    field : RadianceField or path
-        Radiance field (.safetensors).
-    resolution : int
-        Number of grid cells along the longest edge of the field's bounding box.
-    density_threshold : float, optional
-        Density of the extracted surface in 1/unit. Default: absorbs half of the light across a grid cell.
-    progress : bool, Reporter or None
-        Progress and messages (`nerg_mi.progress.Progress`).
+    field, resolution, density_threshold, progress
+        As for `export_mesh`.
 
     Returns
     -------
@@ -343,14 +329,10 @@ def export_volume(
 
     Parameters
     ----------
-    field : RadianceField or path
-        Radiance field (.safetensors).
-    resolution : int
-        Number of grid cells along the longest edge of the field's bounding box.
+    field, resolution, progress
+        As for `export_mesh`.
     color : bool
         Whether to sample the colour, too.
-    progress : bool, Reporter or None
-        Progress and messages (`nerg_mi.progress.Progress`).
 
     Returns
     -------
@@ -382,10 +364,8 @@ def export_torch_ngp(field: RadianceField | FilePath, *, progress: Progress = No
 
     Parameters
     ----------
-    field : RadianceField or path
-        Radiance field (.safetensors).
-    progress : bool, Reporter or None
-        Progress and messages (`nerg_mi.progress.Progress`).
+    field, progress
+        As for `export_mesh`.
 
     Returns
     -------

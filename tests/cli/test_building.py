@@ -20,7 +20,7 @@ import nerg_mi.cli
 from nerg_mi.cli import building
 from nerg_mi.cli.building import DEBUG, GROUPS, find_commands, make_callback
 from nerg_mi.cli.declarations import COMMANDS, Command, argument, extra
-from nerg_mi.cli.signatures import read_signature
+from nerg_mi.cli.signatures import read_parameter_texts, read_signature
 from nerg_mi.cli.table import ROWS, Row
 from nerg_mi.errors import NergError
 from nerg_mi.files.values import FilePath
@@ -307,6 +307,13 @@ def test_a_command_writes_further_files(monkeypatch, tmp_path, capsys):
     row = replace(row, suffices=True)
     assert nerg(row, *more)[:2] == (0, {"b.txt"})
     assert nerg(row)[:2] == (1, set())
+
+
+def test_a_docstring_refers_to_the_texts_of_another_function():
+    module = "nerg_mi.environment.conversion"
+    mesh, points = (read_parameter_texts(read_signature(f"{module}:export_{name}")) for name in ("mesh", "points"))
+    assert set(points) - set(mesh) == {"max_points"} and "grid cells" in points["resolution"]
+    assert {name: points[name] for name in set(points) & set(mesh)} == {k: v for k, v in mesh.items() if k in points}
 
 
 def test_a_command_line_without_a_command_is_refused(monkeypatch, tmp_path, capsys):
