@@ -1,8 +1,8 @@
-"""Gaze probes: placement, densities, measures and highest-density regions."""
+"""Gaze probes: placement, densities and highest-density regions."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +11,6 @@ from nerg_mi.errors import NergError
 from nerg_mi.fields.kde import Backend, SphericalKde, compute_silverman_kappas, select_loo_kappas
 from nerg_mi.maths import vmf
 from nerg_mi.maths.arrays import check_weights
-from nerg_mi.maths.sphere import fibonacci_directions
 
 from .rays import Neighbours, RayIndex, Rays
 
@@ -302,82 +301,6 @@ def _compute_weighted_means(values: np.ndarray, weights: np.ndarray | None, offs
     else:
         scale, weighted = 1.0 / np.add.reduceat(weights, offsets[:-1]), values * weights[:, None]
     return np.add.reduceat(weighted, offsets[:-1]) * scale[:, None]
-
-
-# ---- Measures ----
-#
-# Integral, entropy, effective number of participants, and samples of a probe's density.
-
-_MIN_DIRECTIONS, _MAX_DIRECTIONS = 2048, 1 << 17
-
-
-def count_resolving_directions(kappa: float) -> int:
-    """Return the number of equal-area directions that resolve kernels of ``kappa``: four per width 1/sqrt(κ), 2,048 to
-    131,072.
-    """
-    return int(np.clip(np.ceil(4.0 * np.pi * 16.0 * kappa), _MIN_DIRECTIONS, _MAX_DIRECTIONS))
-
-
-def compute_integral(probes: Probes, count: int | None = None, backend: Backend = None) -> np.ndarray:
-    """Integrate the density of each of the P ``probes`` over the sphere by quadrature, (P,).
-
-    The result is one up to the quadrature error. ``count`` is the number of directions; None:
-    `count_resolving_directions` of the largest κ. ``backend`` is the Dr.Jit backend on which the densities are
-    evaluated (`kde.Backend`).
-    """
-    return _integrate(probes, count, backend, lambda p: p)
-
-
-def compute_entropy(probes: Probes, count: int | None = None, backend: Backend = None) -> np.ndarray:
-    """Compute the differential entropy -∫ p log p of the density p of each of the P ``probes``, in nats, (P,).
-
-    It is computed by quadrature with ``count`` directions on ``backend``, as in `compute_integral`. The maximum is
-    log 4π = 2.53, that of the uniform density.
-    """
-    return -_integrate(probes, count, backend, lambda p: p * np.log(np.where(p > 0, p, 1.0)))
-
-
-def count_effective_participants(probes: Probes, rays: Rays) -> np.ndarray:
-    """Compute the effective number of participants of each of the P ``probes``, (P,): (Σw)²/Σw² over participants,
-    where w is the sum of the weights of the rays of a participant.
-
-    Successive rays of one participant are redundant, so this number, not the number of rays, determines the uncertainty
-    of a probe. ``rays`` are those from which the probes were made.
-    """
-    w = np.ones(len(probes.indices)) if probes.weights is None else probes.weights
-    persons = rays.person[probes.indices]
-    out = np.empty(len(probes))
-    for p, (a, b) in enumerate(zip(probes.offsets[:-1], probes.offsets[1:])):
-        person_weight = np.bincount(persons[a:b], weights=w[a:b])
-        out[p] = person_weight.sum() ** 2 / (person_weight**2).sum()
-    return out
-
-
-def sample_directions(probes: Probes, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Draw ``count`` independent unit directions from the density of each of the P ``probes``, (P, count, 3), with the
-    random numbers of ``rng``."""
-    w = np.ones(len(probes.indices)) if probes.weights is None else probes.weights
-    cumulative = np.concatenate([[0.0], np.cumsum(w)])
-    low, high = cumulative[probes.offsets[:-1]], cumulative[probes.offsets[1:]]
-    at = low[:, None] + rng.random((len(probes), count)) * (high - low)[:, None]
-    ray = np.clip(
-        np.searchsorted(cumulative, at, side="right") - 1, probes.offsets[:-1, None], probes.offsets[1:, None] - 1
-    )
-    mu = probes.directions[ray.ravel()]
-    return vmf.sample(mu, np.repeat(probes.kappa, count), rng).reshape(len(probes), count, 3)
-
-
-def _integrate(
-    probes: Probes, count: int | None, backend: Backend, function: Callable[[np.ndarray], np.ndarray]
-) -> np.ndarray:
-    """Return 4π times the mean of a function of the density over directions of equal area, in blocks of probes."""
-    x = fibonacci_directions(count or count_resolving_directions(float(probes.kappa.max())))
-    kde = probes.kde(backend)
-    out, step = np.empty(len(probes)), max(1, (1 << 24) // len(x))
-    for start in range(0, len(probes), step):
-        density = kde.select_range(start, min(start + step, len(probes))).evaluate(x)
-        out[start : start + step] = 4.0 * np.pi * function(density.astype(np.float64)).mean(axis=1)
-    return out
 
 
 # ---- Highest-density regions ----

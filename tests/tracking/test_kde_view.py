@@ -7,73 +7,16 @@ import pytest
 
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.sphere import fibonacci_directions, sample_uniform_directions
-from nerg_mi.tracking.kde_view import (
-    MIN_TABLE_DIRECTIONS,
-    KdeView,
-    compute_directions,
-    evaluate_kde_frame,
-    make_probe_at,
-)
-from nerg_mi.tracking.rays import RayIndex, Rays
+from nerg_mi.tracking.kde_view import MIN_TABLE_DIRECTIONS, KdeView
+from nerg_mi.tracking.rays import Rays
 from nerg_mi.transport.observer import ObserverCache, evaluate_view
 from tests.reference.kde import kde as reference
-
-# ---- Frame ----
-
-OBSERVER = np.array([1.0, 1.0, 1.6])
 
 
 def rays_of(origin, seed, people=1):
     n, who = len(origin), np.arange(len(origin)) % people
     d = sample_uniform_directions(n, np.random.default_rng(seed))
     return Rays(np.arange(n) * 0.1, who, tuple("abcd"[:people]), origin, d, np.ones(n))
-
-
-@pytest.fixture(scope="module")
-def rays_frame():
-    return rays_of(np.random.default_rng(3).uniform([0, 0, 1.5], [2, 2, 1.7], (4000, 3)), 4, people=4)
-
-
-def wall(h=60, w=90):
-    """Points of a wall in front of the observer, with open sky in one corner."""
-    x, z = np.meshgrid(np.linspace(-2, 4, w), np.linspace(3, 0, h))
-    points = np.stack([x, np.full_like(x, 4.0), z], axis=-1)
-    points[:10, :10] = np.nan
-    return points
-
-
-@pytest.mark.parametrize("method", ["exact", "table", "auto"])
-def test_every_pixel_has_the_density_of_its_direction(rays_frame, method):
-    probe = make_probe_at(rays_frame, OBSERVER, 0.3, kappa_rule="fixed", kappa=25.0, index=RayIndex(rays_frame))
-    points = wall()
-    picture = evaluate_kde_frame(probe, observer=OBSERVER, points=points, method=method, backend="llvm")
-    assert picture.shape == (60, 90) and (picture[:10, :10] == 0).all()
-    d = points - OBSERVER
-    d /= np.linalg.norm(d, axis=-1, keepdims=True)
-    want = reference(d[20:].reshape(-1, 3), probe.directions, probe.offsets, probe.kappa)[0].reshape(40, 90)
-    assert np.allclose(picture[20:], want, rtol=2e-3)
-    is_valid = np.isfinite(points).all(axis=-1)
-    again = evaluate_kde_frame(
-        probe, np.where(is_valid[..., None], d, (0, 0, 1)), mask=is_valid, method=method, backend="llvm"
-    )
-    assert np.allclose(again, picture, rtol=1e-4, atol=1e-6)
-
-
-def test_directions_to_points():
-    d, is_valid = compute_directions(OBSERVER, np.array([[[1, 1, 3.6], OBSERVER, [np.nan, 0, 0]]]))
-    assert is_valid.tolist() == [[True, False, False]] and np.allclose(d, [0, 0, 1])
-
-
-def test_refusals(rays_frame):
-    probe = make_probe_at(rays_frame, OBSERVER)
-    with pytest.raises(ValueError, match="either directions"):
-        evaluate_kde_frame(probe)
-    with pytest.raises(ValueError, match="either directions"):
-        evaluate_kde_frame(probe, points=wall())
-    with pytest.raises(ValueError, match="method"):
-        evaluate_kde_frame(probe, observer=OBSERVER, points=wall(), method="guess")
-    with pytest.raises(ValueError, match="increase the radius"):
-        make_probe_at(rays_frame, [50, 0, 0])
 
 
 # ---- View ----
