@@ -10,6 +10,7 @@ from typing import Any, cast
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.maths.color import composite_to_linear
@@ -23,6 +24,7 @@ from nerg_mi.transport.medium import Medium, SampleShader
 from nerg_mi.transport.observer import ObserverCache, ObserverSettings, ObserverView, evaluate_view
 from nerg_mi.transport.observer_gaze import GazeFieldInstance, ObservedGaze
 from nerg_mi.transport.occlusion import ObserverHit, trace_from_observer
+from nerg_mi.transport.splat_medium import SplatMedium
 
 # Mitsuba, with its arrays typed as in `maths.types`.
 arrays: Any = mi
@@ -144,6 +146,11 @@ class CameraView:
         self.ray, self.origin_offset = (ray, None) if context.ceiling is None else context.ceiling.clip_ray(ray)
         medium = context.medium
         self.geometry = SceneGeometry(medium, scene)
+        # Rays of the whole image, of which this may be a strip.
+        self.num_rays = max([dr.width(ray.o), *(int(np.prod(s.film().crop_size())) for s in sensors)])
+        traced, windows = self.geometry, observer.camera_windows(sensors[0]) if len(sensors) == 1 else None
+        if windows is not None and isinstance(medium, SplatMedium):
+            traced = self.geometry.seen_from(observer.sensor_center(sensors[0]), self.num_rays, windows)
         self.has_color = context.radiance and medium is not None and medium.has_color
         shader, features = None, "features" in context.required_data
         if medium is not None and self.has_color:
@@ -153,7 +160,7 @@ class CameraView:
             shader = FeatureShader(medium)
         self.shader = shader
         self.counts_evaluations = "counts" in context.required_data
-        self.ray_hit = self.geometry.trace(
+        self.ray_hit = traced.trace(
             self.ray, active, context.settings, offset=offset, count=self.counts_evaluations, color=shader
         )
         self.has_matter = active & (self.ray_hit.opacity > 0)
@@ -326,6 +333,7 @@ class Pixel:
             gaze=self.gaze if self._can_use_gaze_map else None,
             cache=self.observer.cache,
             needs_depth=bool(context.required_data & {"factors", "observer_depth"}),
+            num_rays=camera.num_rays,
         )
         if sight.density_evals is not None:
             self._evaluations = sight.density_evals

@@ -26,6 +26,11 @@ Gaussian splats (:monosp:`splats`)
    - |float|
    - Cut-off radius of Gaussians in standard deviations. (Default: 3)
 
+ * - lists
+   - |bool|
+   - Whether rays from one point, of a camera or an observer, may read lists of Gaussians by direction (see below).
+     (Default: true)
+
  * - centers, scales, rotations, opacities, harmonics
    - |tensor|
    - Parameters of the Gaussians, flat: 3, 3, 4 (quaternion, w first), 1 and 3 (degree + 1)² numbers per Gaussian.
@@ -43,6 +48,12 @@ inside them. Colours are composited in their colour space and then converted to 
 Depth refers to the peaks: ``expected`` is their mean, ``median`` (and ``refined``) the peak at which half of the ray's
 own opacity is reached. Of the march parameters only ``stop`` applies (default here: 1e-4), and ``step``, which sets the
 tolerance of occlusion (default: the median thickness of the Gaussians).
+
+With 4,096 Gaussians or more, rays of perspective cameras, panoramas and observers read lists of the Gaussians in their
+direction, as rasterisers do, instead of searching a tree, in about a tenth of the time. Three things differ. Gaussians
+are sorted by the distances of their centres, and by their peaks only among each nine successive ones. Colours are those
+in the directions of the centres, as in 3DGS. Gaussians that absorb less than 1/255 of the light are left out. Other
+rays, derivatives and functions that ``dr.freeze`` records use the tree.
 
 Derivatives reach the Gaussians, cameras and observers as for a radiance field, with memory that does not grow with the
 number of hits. They ignore changes of the set of Gaussians along a ray and of their order.
@@ -76,6 +87,7 @@ from nerg_mi.formats.splats import read_splats
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.properties import (
     make_volume_class,
+    read_boolean,
     read_choice,
     read_number,
     read_string,
@@ -97,6 +109,7 @@ class SplatsVolume(make_volume_class()):
         self.similarity = Similarity(read_transform(props, "to_world"))
         color_space = read_choice(props, "color_space", "file", ("file", "srgb", "linear"))
         extent = read_number(props, "extent", 3, Range(0.1, 10))
+        self.may_list = read_boolean(props, "lists", True)
         self.filename = "" if splats is not None else resolve_scene_file(read_string(props, "filename"))
         super().__init__(props)
         self.splats = splats if splats is not None else read_splats(self.filename)
@@ -113,7 +126,7 @@ class SplatsVolume(make_volume_class()):
 
     def medium(self) -> SplatMedium:
         """The splats as a medium."""
-        return SplatMedium(self.field, self.similarity, self.color_space)
+        return SplatMedium(self.field, self.similarity, self.color_space, self.may_list)
 
     def eval_1(self, it, active=True):
         raise NergError('"splats" have no density at a point; use them as the "field" of "nerg"')

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import dataclass
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, cast
@@ -18,10 +19,13 @@ from nerg_mi.maths.coordinates import check_coordinates
 from nerg_mi.maths.types import Bool, Color, Float, Point3f, Ray3f, Vector3f, variant_types
 
 from .depth import DEPTHS, find_surface_depth, penetration_depth
+from .jit import is_recording
 from .march import march_with_prepass
 from .march_primal import MarchResult, MarchSettings, default_color_cutoff, default_dt_gamma, default_step, default_stop
 from .medium import Medium
 from .mitsuba_mesh import count_faces, read_vertices
+from .splat_lists import Window, list_splats
+from .splat_medium import SplatMedium
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -203,6 +207,24 @@ class SceneGeometry:
     def extent(self, *points: ArrayLike) -> float:
         """Diagonal of the bounding box of the geometry and ``points`` (3,), in scene units."""
         return float(np.linalg.norm(np.ptp([*(self.bounds() or ()), *(np.asarray(p, float) for p in points)], axis=0)))
+
+    def seen_from(self, center: Point3f, rays: int, windows: Sequence[Window] = ()) -> SceneGeometry:
+        """This geometry for ``rays`` rays whose lines pass through ``center`` (one lane, in front of their origins).
+
+        Gaussian splats are listed by direction (`splat_lists.list_splats`), unless there are too few rays; other media
+        are traced alike from everywhere. ``windows``: the directions of the rays in the scene; default: all.
+        """
+        # Lists are made outside of kernels.
+        is_symbolic = is_recording() or dr.flag(dr.JitFlag.SymbolicScope)
+        if not isinstance(self.medium, SplatMedium) or is_symbolic or dr.width(center) != 1:
+            return self
+        to_world = self.medium.to_world
+        turn = to_world.matrix[:3, :3] / to_world.scale
+        local = tuple(w._replace(axes=w.axes @ turn) for w in windows)
+        position = np.array(to_world.point_to_local(dr.detach(center)), np.float64).ravel()
+        seen = copy(self)
+        seen.medium = list_splats(self.medium, position, rays, local)
+        return seen
 
     def trace(self, ray: Ray3f | SceneRay, active: Bool, settings: MarchSettings, **options: Any) -> RayHit:
         """Trace ``ray`` up to its ``maxt``; without shapes a `SceneRay` suffices.

@@ -26,6 +26,7 @@ from .march_primal import (
 )
 from .medium import Hits, LastHit, LocalRay, Medium, SampleShader
 from .quadrature import RULES, absorbed_fraction, cells_for_rule
+from .splat_lists import SplatLists
 
 # ---- Derivatives of a march in steps ----
 #
@@ -359,7 +360,12 @@ def march(
     else:
         # An enclosing derivative, such as that of the albedo of a shape, evaluates loops: each step would be a kernel.
         with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, True):
-            result = (march_primal if medium.hits is None else march_hits)(ray, t0, t1, request)
+            if medium.hits is None:
+                result = march_primal(ray, t0, t1, request)
+            elif isinstance(medium.hits, SplatLists):
+                result = medium.hits.march(ray, t0, t1, request)
+            else:
+                result = march_hits(ray, t0, t1, request)
     result.start_distance = t0
     if until is not None and dr.grad_enabled(until):
         crossed = dr.isfinite(result.median_depth)

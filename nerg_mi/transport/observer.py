@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import drjit as dr
+import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.fields.gaze_base import RaySupport
@@ -16,6 +17,7 @@ from nerg_mi.maths.types import Float, Point3f, Ray3f, Vector3f, variant_types
 from .geometry import SceneGeometry
 from .jit import Fingerprint, fingerprint_shapes, is_recording
 from .march_primal import MarchSettings
+from .splat_lists import CELL_PIXELS, Window
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -242,6 +244,35 @@ def have_same_center(sensors: Sequence[mi.Sensor], p_o: Point3f) -> bool:
 def sensor_centers(sensors: Sequence[mi.Sensor]) -> list[Point3f]:
     """The centre of each sensor, and of each member of a batch."""
     return [sensor_center(m) for s in sensors for m in _members(s)]
+
+
+def camera_windows(sensor: mi.Sensor) -> tuple[Window, ...] | None:
+    """The directions of the rays of ``sensor``, in cells of a few pixels; None unless its rays pass through one point.
+    A panorama has all directions: the empty tuple."""
+    import mitsuba as mi
+
+    if (kind := _kind(sensor)) not in ("PerspectiveCamera", "Panorama"):
+        return None
+    if kind == "Panorama":
+        return ()
+    film = sensor.film()
+    corners: Any = cast("Any", sensor).sample_ray(0, 0.5, mi.Point2f([0, 1, 0], [0, 0, 1]), mi.Point2f(0.5))[0].d
+    axes = [cast("Any", sensor).world_transform() @ mi.Vector3f(*axis) for axis in np.eye(3).tolist()]
+    axes = np.array([np.array(dr.detach(axis)).ravel() for axis in axes], np.float64)
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    x, y, z = axes @ np.array(dr.detach(corners), np.float64)
+    lower, upper, cells = [], [], []
+    for axis, (first, last), size in (
+        (0, (x / z)[[0, 1]], film.crop_size()[0]),
+        (1, (y / z)[[0, 2]], film.crop_size()[1]),
+    ):
+        if last < first:
+            axes[axis], first, last = -axes[axis], -first, -last
+        # One more cell on both sides: a film can sample its border.
+        count = -(-int(size) // CELL_PIXELS)
+        edge = (last - first) / size * CELL_PIXELS
+        lower.append(first - edge), upper.append(first + (count + 1) * edge), cells.append(count + 2)
+    return (Window(axes, tuple(lower), tuple(upper), tuple(cells)),)
 
 
 def center_of_ray(sensors: Sequence[mi.Sensor], ray: Ray3f) -> Point3f:

@@ -217,7 +217,8 @@ class ObserverTracer:
         without one."""
         mi, settings = variant_types(), self.settings
         all_lanes = dr.full(mi.Bool, True, dr.width(directions))
-        ray_hit = self.geometry.trace(mi.Ray3f(self.center, directions), all_lanes, settings.march)
+        seen = self.geometry.seen_from(self.center, dr.width(directions))
+        ray_hit = seen.trace(mi.Ray3f(self.center, directions), all_lanes, settings.march)
         has_surface = all_lanes & ray_hit.has_surface(settings.surface_opacity)
         return has_surface, cast(
             "Float", dr.select(has_surface, ray_hit.depth(settings.depth, has_surface), miss_distance)

@@ -65,7 +65,8 @@ class ObserverDepthMap:
         self._float, self._uint, self._vector = mi.Float, mi.UInt32, mi.Vector3f
         with dr.suspend_grad():
             all_lanes = dr.full(mi.Bool, True, self.width * self.height)
-            ray_hit = geometry.trace(mi.Ray3f(self.center, self._directions()), all_lanes, settings.march)
+            seen = geometry.seen_from(self.center, self.width * self.height)
+            ray_hit = seen.trace(mi.Ray3f(self.center, self._directions()), all_lanes, settings.march)
             has_surface = ray_hit.has_surface(settings.surface_opacity)
             self.depth = dr.select(has_surface, ray_hit.depth(settings.depth, has_surface), dr.inf)
             dr.eval(self.depth)
@@ -186,6 +187,7 @@ def trace_from_observer(
     gaze: ObservedGaze | None = None,
     cache: ObserverCache | None = None,
     needs_depth: bool = True,
+    num_rays: int = 0,
 ) -> ObserverHit:
     """Trace from the observer at ``p_o`` towards the surface point ``p_d`` that the camera sees on ``ray``.
 
@@ -206,6 +208,8 @@ def trace_from_observer(
     needs_depth : bool
         Whether the depth and the surface are needed even where visibility is 0 or 1 without them. If false, rays may
         end early, and the returned depth is only on the correct side of the point.
+    num_rays : int
+        Rays of this observer in all calls; default: those of this call.
     """
     tolerance = _tolerance(geometry, ray, p_d, p_o, settings)
     offset = tolerance + penetration
@@ -227,6 +231,7 @@ def trace_from_observer(
         evals = type(distance)(0)
     else:
         to_point = variant_types().Ray3f(p_o, r_o)
+        geometry = geometry.seen_from(p_o, num_rays or dr.width(p_d))
         if settings.visibility == "transmittance":
             to_point.maxt = distance
             between = geometry.trace(to_point, active, settings.march, count=count)

@@ -106,7 +106,7 @@ _KERNEL_ARRAYS = ("shapes", "colors", "nodes", "places", "order", "corners")
 class SplatArrays:
     """N Gaussians in their own frame, cut off at ``extent`` standard deviations.
 
-    ``ns``: array namespace of the backend. The attributes ``centers``, ``scales``, ``rotations`` (w first),
+    ``namespace``: of the arrays' backend. The attributes ``centers``, ``scales``, ``rotations`` (w first),
     ``opacities`` and ``harmonics`` are flat Floats in the order of ``splats``; call `pack` after changing them. It
     derives, differentiably, what kernels read, in tree order: ``shapes`` and ``colors``; ``nodes`` and ``places``: see
     `BoxTree`; ``corners``: lower and upper corner of all Gaussians, 6 one-lane Floats.
@@ -122,7 +122,7 @@ class SplatArrays:
     harmonics: Float
 
     def __init__(self, splats: Splats, ns: ModuleType, extent: float = 3.0):
-        self._ns, self.count, self.extent = ns, len(splats), float(extent)
+        self.namespace, self.count, self.extent = ns, len(splats), float(extent)
         self.rows = ns.ArrayXf
         self.terms = splats.harmonics.shape[1]
         # Arrays are gathered in packets of four.
@@ -137,7 +137,7 @@ class SplatArrays:
 
     def pack(self) -> None:
         """Derive from the parameters what kernels read."""
-        ns, n = self._ns, self.count
+        ns, n = self.namespace, self.count
         centers, scales, rotations = (
             np.array(dr.detach(getattr(self, name)), np.float64).reshape(n, -1) for name in _PARAMETERS[:3]
         )
@@ -181,7 +181,7 @@ class SplatArrays:
         ``t``: where the Gaussian is densest along the ray; ``absorbed``: the fraction of light absorbed, all of it
         there; ``distance``: squared distance to the centre at that point, in standard deviations.
         """
-        g = dr.gather(self._ns.ArrayXf, self.shapes, index, active, shape=(SHAPE_SIZE, dr.width(index)))
+        g = dr.gather(self.namespace.ArrayXf, self.shapes, index, active, shape=(SHAPE_SIZE, dr.width(index)))
         x, y, z = o.x - g[9], o.y - g[10], o.z - g[11]
         from_center = [dr.fma(g[i], x, dr.fma(g[i + 1], y, g[i + 2] * z)) for i in (0, 3, 6)]
         along = [dr.fma(g[i], d.x, dr.fma(g[i + 1], d.y, g[i + 2] * d.z)) for i in (0, 3, 6)]
@@ -193,9 +193,9 @@ class SplatArrays:
 
     def color(self, index: UInt32, w: Vector3f, active: Bool) -> Color:
         """Colour of the Gaussian ``index`` (in tree order) for the unit ray direction ``w``: a list of three."""
-        c = dr.gather(self._ns.ArrayXf, self.colors, index, active, shape=(self._stride, dr.width(index)))
+        c = dr.gather(self.namespace.ArrayXf, self.colors, index, active, shape=(self._stride, dr.width(index)))
         values = dr.sh_eval(w, round(self.terms**0.5) - 1)
-        sums = [self._ns.Float(0.5)] * 3
+        sums = [self.namespace.Float(0.5)] * 3
         for k, value in enumerate(values):
             sums = [dr.fma(value, c[3 * k + i], total) for i, total in enumerate(sums)]
         return [dr.maximum(total, 0) for total in sums]
@@ -327,7 +327,7 @@ class SplatMedium:
     """Gaussian splats placed in the scene: a `medium.Medium` in their own coordinates.
 
     ``to_world``: splats to scene; default: the identity. ``color_space``: ``srgb``, as trained from photos, or
-    ``linear``.
+    ``linear``. ``may_list``: whether rays from one point may read lists (`splat_lists.list_splats`).
     """
 
     has_color = True
@@ -338,9 +338,14 @@ class SplatMedium:
     occupancy = None
     cells = None
 
-    def __init__(self, arrays: SplatArrays, to_world: Similarity | None = None, color_space: str = "srgb"):
+    def __init__(
+        self, arrays: SplatArrays, to_world: Similarity | None = None, color_space: str = "srgb", may_list: bool = True
+    ):
         self.arrays, self.to_world, self.color_space = arrays, to_world or Similarity(), color_space
+        self.may_list = may_list
         self.hits = SplatHits(arrays)
+        # Lists of recent viewpoints (`splat_lists.list_splats`).
+        self.lists: dict[Any, Any] = {}
 
     @property
     def length_scale(self) -> float:

@@ -68,6 +68,23 @@ def test_colors_match_volprim_rf_basic(rgb, tmp_path, render):
     assert len(difference) > 300 and np.median(difference) < 1e-6 and (difference < 1e-4).mean() > 0.9
 
 
+@pytest.mark.parametrize("border", [False, True])
+def test_lists_change_images_by_less_than_a_grey_level(rgb, render, border):
+    some = concatenate_splats([wall(z=-0.6, half=1.5, spacing=0.06), wall(opacity=0.7, half=1.5, spacing=0.06)])
+    assert len(some) > 4096
+    settings = {"aovs": "depth,opacity,visibility", "observer": camera(rgb, (1.5, 1, 3))}
+    film = {"type": "hdrfilm", "width": 64, "height": 32}
+    around = {"type": "panorama", "to_world": look_at(rgb, (0.3, 0.2, -1.5)), "film": film}
+    for sensor in (camera(rgb, size=48, rfilter="gaussian" if border else "box"), around):
+        exact = render(some, sensor, field={"lists": False}, **settings)
+        listed = render(some, sensor, **settings)
+        for name in ("color", "opacity"):
+            assert np.abs(listed[name] - exact[name]).max() < 1 / 255
+        seen = exact["opacity"] > 0.05
+        np.testing.assert_allclose(listed["depth"][seen], exact["depth"][seen], atol=1e-3)
+        assert (np.abs(listed["visibility"] - exact["visibility"]) > 0.01).mean() < 0.002
+
+
 def test_each_gaussian_is_hit_once(rgb, tmp_path, render):
     # Mitsuba 3.9.1 hits a thin one twice at grazing angles: its next ray starts outside again.
     one = Splats([[0, 0, 0]], [[0.3, 0.05, 0.1]], [[0.8, 0.3, 0.4, 0.2]], [0.5], harmonics_from_colors([[1, 1, 1]]))

@@ -1,0 +1,417 @@
+"""Lists of the Gaussians that rays from one point can meet, by direction: splats as a rasteriser draws them.
+
+Rays of a camera, or of an observer, start at one point. The directions around it are divided into cells; each cell has
+the list of the Gaussians that its rays can meet, sorted by the distance of their centres (tiles of Kerbl et al. 2023,
+"3D Gaussian Splatting"). A ray reads the list of its cell, where the tree of `splat_medium` would search. Gaussians are
+evaluated exactly along the ray. What differs from the tree: their order on a ray is that of their centres, their colour
+is that in the direction of their centre, and those that absorb less than `MIN_ALPHA` are left out.
+"""
+
+from __future__ import annotations
+
+from copy import copy
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, cast
+
+import drjit as dr
+import numpy as np
+
+from nerg_mi.maths.types import Bool, Float, UInt32, Vector3f
+
+from .jit import Fingerprint
+from .march_primal import MarchRequest, MarchResult, optical_depth_limits
+from .medium import ColorShader, LocalRay
+from .splat_medium import MAX_ALPHA, SHAPE_SIZE, SplatArrays, SplatHits, SplatMedium
+
+MIN_ALPHA = 1 / 255
+"""Absorbed fraction below which a Gaussian is left out, as in 3DGS."""
+
+CELL_PIXELS = 16
+"""Edge of a cell of a camera in pixels."""
+
+ROW_SIZE = 16
+"""Numbers per Gaussian: the matrix to its own axes, the vector from its centre to the viewpoint there, its opacity and
+its colour."""
+
+NUM_WAITING = 8
+"""Hits of a ray that wait for nearer ones: the order of centres is corrected as far as that."""
+
+_MARGIN = 0.02  # Cells by which the bounds of a Gaussian are extended for the rounding of directions
+
+
+class Window(NamedTuple):
+    """Directions that a plane shows: u = x / z and v = y / z between ``lower`` and ``upper``, with z > 0."""
+
+    axes: np.ndarray  # Unit vectors x, y and z in the frame of the Gaussians (3, 3)
+    lower: tuple[float, float]
+    upper: tuple[float, float]
+    cells: tuple[int, int]  # Cells along u and v
+
+
+def cube_windows(cells: int) -> tuple[Window, ...]:
+    """The faces of a cube, with ``cells`` along each edge: windows 2 a and 2 a + 1 look along axis a and against it."""
+    unit = np.eye(3)
+    return tuple(
+        Window(np.stack([unit[(a + 1) % 3], unit[(a + 2) % 3], sign * unit[a]]), (-1, -1), (1, 1), (cells, cells))
+        for a in range(3)
+        for sign in (1, -1)
+    )
+
+
+class SplatLists(SplatHits):
+    """The lists of the cells of ``windows`` (one, or the six of `cube_windows`) around ``center``.
+
+    ``center`` (3,) in the frame of the Gaussians ``arrays``. Derivatives are those of the tree.
+    """
+
+    def __init__(self, arrays: SplatArrays, center: np.ndarray, windows: tuple[Window, ...]):
+        super().__init__(arrays)
+        self.windows = windows
+        ns = arrays.namespace
+        self._ns = ns
+        self.center = ns.Array3f(*(float(c) for c in center))
+        # Literals would compile kernels for each viewpoint.
+        dr.make_opaque(self.center)
+        with dr.suspend_grad():
+            bounds = [self._find_cells(window) for window in windows]
+            order = self._sort_visible(np.any([b.count > 0 for b in bounds], axis=0))
+            self.size = len(order)
+            starts, ranks = [np.zeros(1, np.int64)], []
+            for window, rectangle in zip(windows, bounds):
+                begin, members = _list_members(rectangle, order, window.cells)
+                starts.append(begin[1:].astype(np.int64) + starts[-1][-1])
+                ranks.append(members)
+            self.num_entries = int(starts[-1][-1])
+            self._starts = ns.UInt32(np.concatenate(starts).astype(np.uint32))
+            self._entries = ns.UInt32(np.concatenate([*ranks, np.zeros(1, np.int32)]).astype(np.uint32))
+            self._rows, self._indices = self._make_rows(ns.UInt32(order.astype(np.uint32)))
+        first = windows[0]
+        self._axes = [ns.Array3f(*map(float, axis)) for axis in first.axes]
+        self._lower = [ns.Float(float(v)) for v in first.lower]
+        self._rate = [ns.Float(n / (b - a)) for n, a, b in zip(first.cells, first.lower, first.upper)]
+        dr.make_opaque(self._axes, self._lower, self._rate)
+
+    # ---- Lists ----
+
+    def _find_cells(self, window: Window) -> _Rectangles:
+        """The cells of ``window`` that each Gaussian overlaps."""
+        ns, a = self._ns, self.arrays
+        index = dr.arange(ns.UInt32, a.count)
+        g = [dr.gather(ns.Float, a.shapes, index * SHAPE_SIZE + i) for i in range(13)]
+        rows = [ns.Array3f(*g[i : i + 3]) for i in (0, 3, 6)]
+        semi_axes = [row / dr.squared_norm(row) for row in rows]
+        m = ns.Array3f(*g[9:12]) - self.center
+        # Squared extent in standard deviations, within which enough light is absorbed.
+        square = dr.minimum(2 * dr.log(dr.maximum(g[12], 1e-30) / MIN_ALPHA), a.extent**2)
+        axes = [ns.Array3f(*map(float, axis)) for axis in window.axes]
+        dr.make_opaque(axes)
+        x, y, z = (_Extent(dr.dot(axis, m), ns.Array3f(*(dr.dot(axis, s) for s in semi_axes))) for axis in axes)
+        is_visible, limits = square > 0, []
+        for k, across in enumerate((x, y)):
+            low, high = dr.opaque(ns.Float, window.lower[k]), dr.opaque(ns.Float, window.upper[k])
+            left, right, is_seen = _project(across, z, square, low, high)
+            is_visible &= is_seen
+            cells = window.cells[k]
+            to_cell = lambda v, low=low, high=high, n=cells: dr.clip((v - low) / (high - low) * n, -1, n + 1)
+            limits.append(dr.clip(dr.floor(to_cell(left) - _MARGIN), 0, cells))
+            limits.append(dr.clip(dr.floor(to_cell(right) + _MARGIN) + 1, 0, cells))
+        # Empty rectangles for those that are not visible.
+        values = [ns.Int32(dr.select(is_visible, v, 0)) for v in limits]
+        dr.eval(values)
+        return _Rectangles(*(v.numpy() for v in values))
+
+    def _sort_visible(self, is_visible: np.ndarray) -> np.ndarray:
+        """Indices of the Gaussians that any cell shows, in tree order, sorted by the distance of their centres."""
+        ns, (index,) = self._ns, np.nonzero(is_visible)
+        if len(index) == 0:
+            return index
+        i = ns.UInt32(index.astype(np.uint32)) * SHAPE_SIZE
+        m = ns.Array3f(*(dr.gather(ns.Float, self.arrays.shapes, i + 9 + k) for k in range(3))) - self.center
+        return index[np.argsort(dr.squared_norm(m).numpy(), kind="stable")]
+
+    def _make_rows(self, index: UInt32) -> tuple[Float, UInt32]:
+        """Numbers of the Gaussians ``index``, `ROW_SIZE` each."""
+        ns, a = self._ns, self.arrays
+        if dr.width(index) == 0:
+            return dr.zeros(ns.Float, ROW_SIZE), dr.zeros(ns.UInt32, 1)
+        g = [dr.gather(ns.Float, a.shapes, index * SHAPE_SIZE + i) for i in range(13)]
+        m = ns.Array3f(*g[9:12]) - self.center
+        from_center = [-(g[i] * m.x + g[i + 1] * m.y + g[i + 2] * m.z) for i in (0, 3, 6)]
+        color = a.color(index, m * dr.rsqrt(dr.maximum(dr.squared_norm(m), 1e-30)), True)
+        rows = dr.ravel(ns.ArrayXf([*g[:9], *from_center, g[12], *color]))
+        dr.eval(rows)
+        return rows, index
+
+    # ---- Rays ----
+
+    def _find_list(self, d: Vector3f) -> tuple[UInt32, UInt32]:
+        """First and last entry (exclusive) of the cell with the direction ``d``."""
+        ns, (nu, nv) = self._ns, self.windows[0].cells
+        if len(self.windows) == 1:
+            x, y, z = (dr.dot(axis, d) for axis in self._axes)
+            face = ns.UInt32(0)
+        else:
+            size = [dr.abs(d.x), dr.abs(d.y), dr.abs(d.z)]
+            is_x = (size[0] >= size[1]) & (size[0] >= size[2])
+            is_y = ~is_x & (size[1] >= size[2])
+            pick = lambda a, b, c: dr.select(is_x, a, dr.select(is_y, b, c))
+            x, y, along = pick(d.y, d.z, d.x), pick(d.z, d.x, d.y), pick(d.x, d.y, d.z)
+            z = dr.abs(along)
+            face = pick(ns.UInt32(0), ns.UInt32(2), ns.UInt32(4)) + dr.select(along < 0, ns.UInt32(1), ns.UInt32(0))
+        cell = []
+        for value, low, rate, count in zip((x, y), self._lower, self._rate, (nu, nv)):
+            cell.append(ns.UInt32(dr.clip((value / z - low) * rate, 0, count - 1)))
+        number = (face * nv + cell[1]) * nu + cell[0]
+        return dr.gather(ns.UInt32, self._starts, number), dr.gather(ns.UInt32, self._starts, number + 1)
+
+    def march(self, ray: LocalRay, t0: Float, t1: Float, request: MarchRequest) -> MarchResult:
+        """March ``ray``, whose line passes through the viewpoint in front of its origin, as `march_hits` does."""
+        ns, Float = self._ns, type(t0)
+        medium, shader, occlusion = request.medium, request.color, request.occlusion
+        goal, end = optical_depth_limits(Float, request.settings, request.until)
+        goal_light, stop = dr.exp(-goal), dr.exp(-end)
+        # Distances of peaks are measured from the viewpoint.
+        offset = dr.norm(ray.o - self.center) * dr.rsqrt(dr.squared_norm(ray.d))
+        t0, t1 = t0 + offset, t1 + offset
+        entry, last = self._find_list(ray.d)
+
+        def evaluate(rank: UInt32, active: Bool) -> tuple[Float, Float, Bool]:
+            """``(t, alpha, hit)`` of the Gaussian ``rank``; t from the viewpoint."""
+            at = lambda i: dr.gather(Float, self._rows, rank * ROW_SIZE + i, active)
+            along = [dr.fma(at(i), ray.d.x, dr.fma(at(i + 1), ray.d.y, at(i + 2) * ray.d.z)) for i in (0, 3, 6)]
+            origin = [at(9), at(10), at(11)]
+            dot = lambda a, b: dr.fma(a[0], b[0], dr.fma(a[1], b[1], a[2] * b[2]))
+            square = dot(along, along)
+            t = -dot(origin, along) / dr.select(square > 0, square, 1)
+            off = [dr.fma(t, v, p) for v, p in zip(along, origin)]
+            distance = dot(off, off)
+            alpha = dr.minimum(at(12) * dr.exp(-0.5 * distance), MAX_ALPHA)
+            return t, alpha, active & (t >= t0) & (t < t1) & (alpha >= MIN_ALPHA) & (distance < self.arrays.extent**2)
+
+        def blend(ray_state: _Blend, nearest: _Hit, active: Bool) -> tuple[_Blend, Bool]:
+            """Absorb light in the hit ``nearest``; also whether the ray goes on."""
+            state, t = replace(ray_state), nearest.t
+            active = active & (nearest.alpha > 0)
+            weight = dr.select(active, state.light * nearest.alpha, 0)
+            light = state.light - weight
+            crosses = active & (state.light > goal_light) & (light <= goal_light)
+            state.median = dr.select(crosses, t, state.median)
+            state.light_before = dr.select(crosses, state.light, state.light_before)
+            state.light, state.moment = light, dr.fma(weight, dr.select(active, t - t0, 0), state.moment)
+            if isinstance(shader, ColorShader):
+                at = lambda i: dr.gather(Float, self._rows, nearest.rank * ROW_SIZE + i, active)
+                state.color = state.color + weight * shader.array_type(at(13), at(14), at(15))
+            elif shader is not None:
+                index = dr.gather(ns.UInt32, self._indices, nearest.rank, active)
+                color = shader.shade(medium, [cast("Float", index)], ray.o + ray.d * (t - offset), ray.w, active)
+                state.color = state.color + weight * color
+            if state.color_evals is not None:
+                state.color_evals = state.color_evals + dr.select(active, 1, 0)
+            goes_on = light > stop
+            if occlusion is not None:
+                # Not whether the ray is clear: a nearer Gaussian can follow in the list.
+                is_hidden = active & occlusion.is_hidden(t - offset, -dr.log(light))
+                state.decided, goes_on = state.decided | is_hidden, goes_on & ~is_hidden
+            return state, goes_on
+
+        def body(walk: _Walk) -> tuple[_Walk]:
+            rank = dr.gather(ns.UInt32, self._entries, walk.entry, walk.active)
+            t, alpha, hit = evaluate(rank, walk.active)
+            # What is no hit comes first, and absorbs nothing.
+            new = _Hit(dr.select(hit, t, -dr.inf), dr.select(hit, alpha, 0), rank)
+            nearest, waiting = _exchange(walk.waiting, new)
+            blended, goes_on = blend(walk.blended, nearest, hit)
+            if blended.density_evals is not None:
+                blended.density_evals = blended.density_evals + dr.select(walk.active, 1, 0)
+            entry = walk.entry + 1
+            return (_Walk(walk.active & goes_on & (entry < last), entry, waiting, blended),)
+
+        zero = request.init_result(Float)
+        none = _Hit(Float(-dr.inf), Float(0), ns.UInt32(0))
+        counts = zero.decided, zero.density_evals, zero.color_evals
+        blended = _Blend(Float(1), Float(0), Float(dr.inf), Float(1), zero.color, *counts)
+        start = _Walk(request.active & (entry < last), entry, [none] * NUM_WAITING, blended)
+        (walk,) = dr.while_loop((start,), lambda walk: walk.active, body, label="entries")
+        blended, goes_on = walk.blended, request.active & (walk.blended.light > stop)
+        if blended.decided is not None:
+            goes_on &= ~blended.decided
+        for hit in walk.waiting:
+            blended, ends = blend(blended, hit, goes_on)
+            goes_on &= ends
+        is_crossed = dr.isfinite(blended.median)
+        distance = dr.select(is_crossed, blended.median - offset, dr.inf)
+        return replace(
+            zero,
+            tau=-dr.log(blended.light),
+            moment=blended.moment,
+            median_depth=distance,
+            crossing_start=dr.select(is_crossed, distance, 0),
+            crossing_start_tau=dr.select(is_crossed, -dr.log(blended.light_before), 0),
+            color=blended.color,
+            decided=blended.decided,
+            density_evals=blended.density_evals,
+            color_evals=blended.color_evals,
+        )
+
+
+class _Extent(NamedTuple):
+    """Gaussians along one axis: their centres, and their semi-axes of one standard deviation."""
+
+    center: Float
+    semi_axes: Any
+
+
+def _project(across: _Extent, along: _Extent, square: Float, low: Float, high: Float) -> tuple[Float, Float, Bool]:
+    """Bounds of ellipsoids on a plane at distance 1, and whether they overlap the interval from ``low`` to ``high``.
+
+    A plane through the viewpoint, x = u z, touches the ellipsoid of squared extent k^2 where (m_x - u m_z)^2 = k^2
+    |L_x - u L_z|^2, with the centre m and the semi-axes L. The discriminant is written without differences of large
+    numbers.
+    """
+    (mx, Lx), (mz, Lz) = across, along
+    in_front = mz * mz - square * dr.squared_norm(Lz)
+    root = square * (dr.squared_norm(mz * Lx - mx * Lz) - square * dr.squared_norm(dr.cross(Lx, Lz)))
+    mean, spread = mx * mz - square * dr.dot(Lx, Lz), dr.sqrt(dr.maximum(root, 0))
+    inverse = dr.rcp(dr.select(in_front != 0, in_front, 1e-30))
+    tangents = (mean - spread) * inverse, (mean + spread) * inverse
+    first, last = dr.minimum(*tangents), dr.maximum(*tangents)
+    # An ellipsoid that reaches behind the viewpoint is seen outside of both tangents, if there are any.
+    is_around = (in_front <= 0) & (root > 0)
+    is_between = lambda v: is_around & (v > first) & (v < last)
+    left = dr.select(in_front > 0, first, dr.select(is_between(low), last, low))
+    right = dr.select(in_front > 0, last, dr.select(is_between(high), first, high))
+    is_behind = (in_front > 0) & (mz < 0)
+    return left, right, ~is_behind & (left <= high) & (right >= low) & (left <= right)
+
+
+class _Rectangles(NamedTuple):
+    """Cells of a window that each of N Gaussians overlaps: begin and end (exclusive) along both axes, (N,) each."""
+
+    left: np.ndarray
+    right: np.ndarray
+    bottom: np.ndarray
+    top: np.ndarray
+
+    @property
+    def count(self) -> np.ndarray:
+        """Number of cells (N,)."""
+        return (self.right - self.left) * (self.top - self.bottom)
+
+
+def _list_members(bounds: _Rectangles, order: np.ndarray, cells: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Sort Gaussians into cells.
+
+    Returns
+    -------
+    starts : array (cells + 1,)
+        First entry of each cell, row by row.
+    ranks : array
+        For all cells one after the other, the ranks in ``order`` of the Gaussians that overlap it, ascending.
+    """
+    from scipy.sparse import csr_array
+
+    left, bottom = bounds.left[order], bounds.bottom[order]
+    width, count = (bounds.right - bounds.left)[order], bounds.count[order]
+    starts = np.concatenate([[0], np.cumsum(count, dtype=np.int64)])
+    within = np.arange(starts[-1], dtype=np.int32) - np.repeat(starts[:-1].astype(np.int32), count)
+    row, column = np.divmod(within, np.repeat(np.maximum(width, 1), count))
+    cell = (np.repeat(bottom, count) + row) * cells[0] + np.repeat(left, count) + column
+    # A matrix with a row per Gaussian: its columns are the lists, whose entries keep the order of the rows.
+    matrix = csr_array((np.ones(len(cell), np.int8), cell, starts), shape=(len(order), cells[0] * cells[1])).tocsc()
+    return matrix.indptr, matrix.indices
+
+
+@dataclass
+class _Hit:
+    """A Gaussian on a ray: distance from the viewpoint, absorbed fraction (0: none) and rank."""
+
+    t: Float
+    alpha: Float
+    rank: UInt32
+
+
+@dataclass
+class _Blend:
+    """Sums along a ray. Distances are measured from the viewpoint."""
+
+    # Light that is not absorbed yet.
+    light: Float
+    moment: Float
+    # Distance at which the light falls below the goal, and the light in front of it.
+    median: Float
+    light_before: Float
+    color: Any
+    decided: Bool | None
+    density_evals: Float | None
+    color_evals: Float | None
+
+
+@dataclass
+class _Walk:
+    """Loop state of a ray along its list."""
+
+    active: Bool
+    entry: UInt32
+    # Hits that wait for nearer ones in the rest of the list, nearest first.
+    waiting: list[_Hit]
+    blended: _Blend
+
+
+def _exchange(waiting: list[_Hit], new: _Hit) -> tuple[_Hit, list[_Hit]]:
+    """Insert ``new`` into the sorted hits ``waiting``; return the nearest of all, and the others."""
+
+    def order(a: _Hit, b: _Hit) -> tuple[_Hit, _Hit]:
+        swap = b.t < a.t
+        pick = lambda x, y: _Hit(*(dr.select(swap, v, w) for v, w in zip(vars(x).values(), vars(y).values())))
+        return pick(b, a), pick(a, b)
+
+    if not waiting:
+        return new, []
+    nearest, rest = order(waiting[0], new)
+    others = []
+    for hit in waiting[1:]:
+        nearer, rest = order(hit, rest)
+        others.append(nearer)
+    return nearest, [*others, rest]
+
+
+# ---- Choice ----
+
+MIN_GAUSSIANS = 1 << 12
+"""Number of Gaussians below which the tree is fast enough."""
+
+MIN_RAYS_PER_GAUSSIAN = 1 / 16
+"""Number of rays per Gaussian from which the lists, which are made for them, take less time than the tree."""
+
+_MAX_LISTS = 4  # Viewpoints whose lists a medium keeps
+
+
+def cells_of_observer(count: int) -> int:
+    """Cells along the edge of a face of the cube around an observer among ``count`` Gaussians."""
+    return int(np.clip(round(np.sqrt(count) / 8), 16, 128))
+
+
+def list_splats(medium: SplatMedium, center: np.ndarray, rays: int, windows: tuple[Window, ...] = ()) -> SplatMedium:
+    """The ``medium`` for ``rays`` rays from ``center``, with lists where they take less time than the tree.
+
+    Parameters
+    ----------
+    center : array (3,)
+        Viewpoint in the frame of the Gaussians. The line of each ray passes through it, in front of the ray's origin.
+    windows : tuple of Window
+        Directions of the rays, in that frame; default: all.
+    """
+    arrays = medium.arrays
+    if not medium.may_list or arrays.count < MIN_GAUSSIANS or rays < MIN_RAYS_PER_GAUSSIAN * arrays.count:
+        return medium
+    windows = windows or cube_windows(cells_of_observer(arrays.count))
+    key = (tuple(map(float, center)), tuple((w.axes.tobytes(), w.lower, w.upper, w.cells) for w in windows))
+    made_of = Fingerprint([arrays.shapes, arrays.colors])
+    lists = medium.lists
+    if key not in lists or lists[key][0] != made_of:
+        lists[key] = made_of, SplatLists(arrays, center, windows)
+        while len(lists) > _MAX_LISTS:
+            del lists[next(iter(lists))]
+    seen = copy(medium)
+    seen.hits = lists[key][1]
+    return seen
