@@ -75,13 +75,13 @@ class SplatLists(SplatHits):
         with dr.suspend_grad():
             bounds = [self._find_cells(window) for window in windows]
             order = self._sort_visible(np.any([b.count > 0 for b in bounds], axis=0))
-            self.size = len(order)
             starts, ranks = [np.zeros(1, np.int64)], []
             for window, rectangle in zip(windows, bounds):
                 begin, members = _list_members(rectangle, order, window.cells)
                 starts.append(begin[1:].astype(np.int64) + starts[-1][-1])
                 ranks.append(members)
-            self.num_entries = int(starts[-1][-1])
+            # Numbers of all lists.
+            self.size = ROW_SIZE * len(order) + int(starts[-1][-1])
             self._starts = ns.UInt32(np.concatenate(starts).astype(np.uint32))
             self._entries = ns.UInt32(np.concatenate([*ranks, np.zeros(1, np.int32)]).astype(np.uint32))
             self._rows, self._indices = self._make_rows(ns.UInt32(order.astype(np.uint32)))
@@ -383,7 +383,7 @@ MIN_GAUSSIANS = 1 << 12
 MIN_RAYS_PER_GAUSSIAN = 1 / 16
 """Number of rays per Gaussian from which the lists, which are made for them, take less time than the tree."""
 
-_MAX_LISTS = 4  # Viewpoints whose lists a medium keeps
+_MAX_KEPT = 1 << 26  # Numbers in the lists of earlier viewpoints that a medium keeps, 4 bytes each
 
 
 def cells_of_observer(count: int) -> int:
@@ -407,11 +407,13 @@ def list_splats(medium: SplatMedium, center: np.ndarray, rays: int, windows: tup
     windows = windows or cube_windows(cells_of_observer(arrays.count))
     key = (tuple(map(float, center)), tuple((w.axes.tobytes(), w.lower, w.upper, w.cells) for w in windows))
     made_of = Fingerprint([arrays.shapes, arrays.colors])
-    lists = medium.lists
-    if key not in lists or lists[key][0] != made_of:
-        lists[key] = made_of, SplatLists(arrays, center, windows)
-        while len(lists) > _MAX_LISTS:
-            del lists[next(iter(lists))]
+    kept, lists = medium.lists.pop(key, (None, None))
+    if lists is None or kept != made_of:
+        lists = SplatLists(arrays, center, windows)
+        # The lists of a camera and of an observer are kept in any case.
+        while len(medium.lists) > 1 and sum(other.size for _, other in medium.lists.values()) > _MAX_KEPT:
+            del medium.lists[next(iter(medium.lists))]
+    medium.lists[key] = made_of, lists
     seen = copy(medium)
-    seen.hits = lists[key][1]
+    seen.hits = lists
     return seen

@@ -73,11 +73,11 @@ def trace(rgb, medium, center, d, start=0.0, windows=None):
 def sum_exactly(splats, center, d, start=0.0, stop=1e-4):
     """The same in float64, with Gaussians sorted by their peaks."""
     turn = quaternions_to_matrices(splats.rotations.astype(np.float64))
-    own = turn.transpose(0, 2, 1) / splats.scales[:, :, None].astype(np.float64)
-    offset = own @ (center - splats.centers.astype(np.float64))[:, :, None]
+    to_axes = turn.transpose(0, 2, 1) / splats.scales[:, :, None].astype(np.float64)
+    offset = to_axes @ (center - splats.centers.astype(np.float64))[:, :, None]
     out = []
     for direction in np.asarray(d, np.float32).astype(np.float64):
-        along = (own @ direction)[:, :, None]
+        along = (to_axes @ direction)[:, :, None]
         t = -(offset * along).sum((1, 2)) / (along**2).sum((1, 2))
         square = ((offset + t[:, None, None] * along) ** 2).sum((1, 2))
         alpha = np.minimum(splats.opacities * np.exp(-square / 2), MAX_ALPHA)
