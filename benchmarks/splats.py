@@ -106,14 +106,18 @@ def times(scene: Path, files: dict, runs: int) -> list[dict]:
     loaded = {}
     width, height = SIZE
     colour, observed = {"aovs": "opacity", "occlusion": "false"}, {"aovs": "depth,opacity,gaze,visibility"}
+    tree = scene.with_name("tree.xml")
+    tree.write_text(scene.read_text().replace('type="splats">', 'type="splats"><boolean name="lists" value="false"/>'))
     for name, overrides in {
         "colour, stop 0.01": colour | {"stop": "0.01"},
         "colour": colour,
+        "colour, by the tree": colour,
         "colour, depth and gaze of an observer": observed,
+        "the same, by the tree": observed,
         "the same, by the observer's map": observed | {"visibility": "map"},
     }.items():
         stop = overrides.pop("stop", None)
-        path = scene
+        path = tree if "tree" in name else scene
         if stop is not None:
             path = scene.with_name("stop.xml")
             text = scene.read_text().replace(

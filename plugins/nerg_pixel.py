@@ -10,7 +10,6 @@ from typing import Any, cast
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.maths.color import composite_to_linear
@@ -147,7 +146,7 @@ class CameraView:
         medium = context.medium
         self.geometry = SceneGeometry(medium, scene)
         # Rays of the whole image, of which this may be a strip.
-        self.num_rays = max([dr.width(ray.o), *(int(np.prod(s.film().crop_size())) for s in sensors)])
+        self.num_rays = max([dr.width(ray.o), *(int(dr.prod(s.film().crop_size())) for s in sensors)])
         traced, windows = self.geometry, observer.camera_windows(sensors[0]) if len(sensors) == 1 else None
         if windows is not None and isinstance(medium, SplatMedium):
             traced = self.geometry.seen_from(observer.sensor_center(sensors[0]), self.num_rays, windows)

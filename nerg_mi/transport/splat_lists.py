@@ -137,8 +137,8 @@ class SplatLists(SplatHits):
         g = [dr.gather(ns.Float, a.shapes, index * SHAPE_SIZE + i) for i in range(13)]
         m = ns.Array3f(*g[9:12]) - self.center
         from_center = [-(g[i] * m.x + g[i + 1] * m.y + g[i + 2] * m.z) for i in (0, 3, 6)]
-        color = a.color(index, m * dr.rsqrt(dr.maximum(dr.squared_norm(m), 1e-30)), True)
-        rows = dr.ravel(ns.ArrayXf([*g[:9], *from_center, g[12], *color]))
+        color = a.color(index, m * dr.rsqrt(dr.maximum(dr.squared_norm(m), 1e-30)), ns.Bool(True))
+        rows: Any = dr.ravel(ns.ArrayXf([*g[:9], *from_center, g[12], *color]))
         dr.eval(rows)
         return rows, index
 
@@ -208,7 +208,7 @@ class SplatLists(SplatHits):
             if state.color_evals is not None:
                 state.color_evals = state.color_evals + dr.select(active, 1, 0)
             goes_on = light > stop
-            if occlusion is not None:
+            if occlusion is not None and state.decided is not None:
                 # Not whether the ray is clear: a nearer Gaussian can follow in the list.
                 is_hidden = active & occlusion.is_hidden(t - offset, -dr.log(light))
                 state.decided, goes_on = state.decided | is_hidden, goes_on & ~is_hidden
@@ -383,7 +383,7 @@ MIN_GAUSSIANS = 1 << 12
 MIN_RAYS_PER_GAUSSIAN = 1 / 16
 """Number of rays per Gaussian from which the lists, which are made for them, take less time than the tree."""
 
-_MAX_KEPT = 1 << 26  # Numbers in the lists of earlier viewpoints that a medium keeps, 4 bytes each
+_MAX_NUMBERS = 1 << 26  # Numbers in the lists of earlier viewpoints that a medium keeps, 4 bytes each
 
 
 def cells_of_observer(count: int) -> int:
@@ -407,11 +407,11 @@ def list_splats(medium: SplatMedium, center: np.ndarray, rays: int, windows: tup
     windows = windows or cube_windows(cells_of_observer(arrays.count))
     key = (tuple(map(float, center)), tuple((w.axes.tobytes(), w.lower, w.upper, w.cells) for w in windows))
     made_of = Fingerprint([arrays.shapes, arrays.colors])
-    kept, lists = medium.lists.pop(key, (None, None))
-    if lists is None or kept != made_of:
+    earlier, lists = medium.lists.pop(key, (None, None))
+    if lists is None or earlier != made_of:
         lists = SplatLists(arrays, center, windows)
         # The lists of a camera and of an observer are kept in any case.
-        while len(medium.lists) > 1 and sum(other.size for _, other in medium.lists.values()) > _MAX_KEPT:
+        while len(medium.lists) > 1 and sum(other.size for _, other in medium.lists.values()) > _MAX_NUMBERS:
             del medium.lists[next(iter(medium.lists))]
     medium.lists[key] = made_of, lists
     seen = copy(medium)
