@@ -549,7 +549,9 @@ class NergIntegrator(mi.SamplingIntegrator):
 
     def sample(self, scene, sampler, ray: Any, medium=None, active: Any = True):
         active = variant_types().Bool(active)
-        camera = self.context().trace(scene, self._sensors or scene.sensors(), sampler, ray, active)
+        # Another integrator that calls this one may have chosen any sensor.
+        sensors, is_chosen = self._sensors or scene.sensors(), self._sensors is not None
+        camera = self.context().trace(scene, sensors, sampler, ray, active, is_chosen)
         aovs = camera.make_pixel().compute_channels(self.aovs)
         L, shown, nested = camera.compute_radiance(scene, sampler, medium)
         return dr.select(active, L, 0), shown, aovs + nested

@@ -18,6 +18,7 @@ from nerg_mi.transport import aovs as nerg_aovs
 from nerg_mi.transport import observer
 from nerg_mi.transport.field_medium import FeatureShader, make_color_shader
 from nerg_mi.transport.geometry import Ceiling, SceneGeometry, Shading
+from nerg_mi.transport.jit import is_recording
 from nerg_mi.transport.march_primal import MarchResult, MarchSettings
 from nerg_mi.transport.medium import Medium, SampleShader
 from nerg_mi.transport.observer import ObserverCache, ObserverSettings, ObserverView, evaluate_view
@@ -85,12 +86,19 @@ class RenderContext:
             )
 
     def trace(
-        self, scene: mi.Scene, sensors: Sequence[mi.Sensor], sampler: mi.Sampler, ray: Ray3f, active: Bool
+        self,
+        scene: mi.Scene,
+        sensors: Sequence[mi.Sensor],
+        sampler: mi.Sampler,
+        ray: Ray3f,
+        active: Bool,
+        may_list: bool = True,
     ) -> CameraView:
-        """Trace rays of ``sensors``. Raises ``NergError`` for a scene without a medium and shapes."""
+        """Trace rays of ``sensors`` (``may_list``: see `CameraView`). Raises ``NergError`` for a scene without a medium
+        and shapes."""
         self.check_scene(scene)
         offset = cast("Any", sampler).next_1d(active) if self.jitter else None
-        return CameraView(self, scene, sensors, ray, active, offset)
+        return CameraView(self, scene, sensors, ray, active, offset, may_list)
 
     def make_observer(self, position: Sequence[float], is_only: bool = False) -> ObserverContext:
         """The observer at ``position`` (3,). ``is_only``: the only one, whose data is kept in the integrator's
@@ -129,6 +137,8 @@ class CameraView:
         Sensors that rays may come from.
     offset : Float or None
         Shift of the march as a fraction of a step.
+    may_list : bool
+        Whether all rays certainly come from ``sensors``, so that splats can be listed by direction.
     """
 
     def __init__(
@@ -139,6 +149,7 @@ class CameraView:
         ray: Ray3f,
         active: Bool,
         offset: Float | None,
+        may_list: bool = True,
     ):
         self.context, self.sensors, self.camera_ray, self.active = context, sensors, ray, active
         # The traced ray, and the distance between both origins.
@@ -146,10 +157,9 @@ class CameraView:
         medium = context.medium
         self.geometry = SceneGeometry(medium, scene)
         # Rays of the whole image, of which this may be a strip.
-        self.num_rays = max([dr.width(ray.o), *(int(dr.prod(s.film().crop_size())) for s in sensors)])
-        traced, windows = self.geometry, observer.camera_windows(sensors[0]) if len(sensors) == 1 else None
-        if windows is not None and isinstance(medium, SplatMedium):
-            traced = self.geometry.seen_from(observer.sensor_center(sensors[0]), self.num_rays, windows)
+        self.num_rays = sum(int(dr.prod(s.film().crop_size())) for s in sensors) or dr.width(ray.o)
+        can_list = may_list and isinstance(medium, SplatMedium) and not is_recording()
+        traced = self._list_splats() if can_list else self.geometry
         self.has_color = context.radiance and medium is not None and medium.has_color
         shader, features = None, "features" in context.required_data
         if medium is not None and self.has_color:
@@ -163,6 +173,13 @@ class CameraView:
             self.ray, active, context.settings, offset=offset, count=self.counts_evaluations, color=shader
         )
         self.has_matter = active & (self.ray_hit.opacity > 0)
+
+    def _list_splats(self) -> SceneGeometry:
+        """The geometry for rays of a single camera with a centre."""
+        windows = observer.camera_windows(self.sensors[0]) if len(self.sensors) == 1 else None
+        if windows is None:
+            return self.geometry
+        return self.geometry.seen_from(observer.sensor_center(self.sensors[0]), self.num_rays, windows)
 
     def make_pixel(self, observer: ObserverContext | None = None, is_aligned: bool = False) -> Pixel:
         """These rays for an observer; None: that of the context. ``is_aligned``: whether the observer is known to be at
