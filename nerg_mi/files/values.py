@@ -199,6 +199,14 @@ def _refuse(name: str, kind: str, expected: str, array: np.ndarray) -> NergError
     return NergError(f"{name} must contain {expected}, got {kind}{example}; {remedy}")
 
 
+def parse_float(text: str) -> float:
+    """Return the number that ``text`` is in tables, as `float`. Raises ``ValueError``, also for 1_000: in a table that
+    is the name of a trial."""
+    if "_" in text:
+        raise ValueError(f"could not convert string to float: {text[:60]!r}")
+    return float(text)
+
+
 # ---- Names ----
 #
 # Equal names may be different sequences of code points: composed or decomposed ("ö", which macOS writes decomposed),

@@ -17,7 +17,7 @@ from nerg_mi.errors import NergError, sanitize
 from nerg_mi.fields.splats import quaternions_to_matrices
 from nerg_mi.files.safe_read import is_regular_file, read_json, translate_read_errors
 from nerg_mi.files.tables import open_csv
-from nerg_mi.files.values import normalize_name
+from nerg_mi.files.values import normalize_name, parse_float
 from nerg_mi.ranges import MAX_COORDINATE
 
 # ---- Boxes ----
@@ -345,7 +345,7 @@ def _read_rows(path: Path, columns: list[str]) -> dict[str, np.ndarray]:
             if int(row[time]) >= 0:
                 moving.add(row[uid])
                 continue
-            values = np.array([float(row[k]) for k in columns_at])
+            values = np.array([parse_float(row[k]) for k in columns_at])
             if not (np.abs(values) < 1e6).all():
                 raise ValueError(f"the object {sanitize(row[uid], 40)} has invalid numbers")
             if columns == _BOX_COLUMNS and not (values[:3] <= values[3:]).all():

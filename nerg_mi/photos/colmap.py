@@ -25,6 +25,7 @@ from nerg_mi.files.safe_read import (
     open_file,
     resolve_path,
 )
+from nerg_mi.files.values import parse_float
 from nerg_mi.maths.transforms import ROTATION_TOLERANCE
 
 from .observed import MatchedImage, PointTable
@@ -532,7 +533,7 @@ def _read_cameras_txt(path: Path) -> dict[int, _Camera]:
     for number, words in _iter_rows(path, MAX_IMAGES, "cameras"):
         try:
             index = int(words[0])
-            camera = _Camera(words[1], int(words[2]), int(words[3]), tuple(map(float, words[4:])))
+            camera = _Camera(words[1], int(words[2]), int(words[3]), tuple(map(parse_float, words[4:])))
         except (ValueError, IndexError) as e:
             raise _bad_line(path, number, words, "CAMERA_ID MODEL WIDTH HEIGHT PARAMETERS") from e
         _add_camera(out, index, camera, path)
@@ -550,7 +551,7 @@ def _read_images_txt(path: Path, with_points: bool = False) -> list[_ImageRecord
             follows_image = False
             continue
         try:
-            q, t = tuple(map(float, words[1:5])), tuple(map(float, words[5:8]))
+            q, t = tuple(map(parse_float, words[1:5])), tuple(map(parse_float, words[5:8]))
             if len(q) != 4 or len(t) != 3 or not words[9:]:
                 raise ValueError
             # Names may contain several spaces, and tabs.
@@ -582,8 +583,8 @@ def _are_observations(words: list[str]) -> bool:
 def _read_points_txt(path: Path) -> Iterator[_Point]:
     for number, words in _iter_rows(path, MAX_POINTS, "points"):
         try:
-            position = float(words[1]), float(words[2]), float(words[3])
-            yield *position, float(words[7]), (len(words) - 8) // 2, int(words[0])
+            position = parse_float(words[1]), parse_float(words[2]), parse_float(words[3])
+            yield *position, parse_float(words[7]), (len(words) - 8) // 2, int(words[0])
         except (ValueError, IndexError) as e:
             raise NergError(f'line {number} of "{path}" is not "POINT3D_ID X Y Z R G B ERROR TRACK"') from e
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError, parameter, sanitize
 from nerg_mi.files.safe_read import is_regular_file, read_line_blocks, resolve_path
+from nerg_mi.files.values import parse_float
 from nerg_mi.maths.coordinates import check_near_origin
 from nerg_mi.maths.transforms import check_rigid_transforms, nearest_rotation
 
@@ -480,7 +481,7 @@ def _convert(path: str | os.PathLike, lines: Sequence[tuple[int, str]], columns:
                 f'"{path}", line {number}: {len(cells)} cells, the header has {columns[0]}; copy the file again'
             )
         try:
-            rows.append([float(cells[i]) for i in columns[2:]])
+            rows.append([parse_float(cells[i]) for i in columns[2:]])
         except ValueError:
             raise NergError(
                 f'"{path}", line {number}: {sanitize(line, 60)!r} is not a point; copy the file again'

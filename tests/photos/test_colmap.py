@@ -345,6 +345,14 @@ def test_a_bad_line_of_text_is_numbered(tmp_path, name):
         read_colmap(tmp_path, tmp_path)
 
 
+def test_digits_joined_by_underscores_are_no_number(tmp_path):
+    (tmp_path / "a.png").write_bytes(b"")
+    write_txt(tmp_path, ["a.png"])
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 20 10 9_5 9_5 10 5\n")
+    with pytest.raises(NergError, match='line 1 of ".*cameras.txt"'):
+        read_colmap(tmp_path, tmp_path)
+
+
 def test_decimal_commas_of_text_are_named(tmp_path):
     (tmp_path / "a.png").write_bytes(b"")
     write_txt(tmp_path, ["a.png"])

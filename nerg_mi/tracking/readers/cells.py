@@ -87,7 +87,8 @@ def _parse_number(word: str) -> float | None:
 def parse_vectors(cells: Sequence[str], size: int) -> tuple[np.ndarray, np.ndarray]:
     """Vectors (n, size) of ``cells``, NaN for missing ones, and which cells are not vectors of this size, (n,) bool."""
     out, is_bad = np.full((len(cells), size), np.nan), np.zeros(len(cells), bool)
-    if all(cell[:1] == "(" and cell[-1:] == ")" and cell.count(",") == size - 1 for cell in cells):
+    is_plain = lambda cell: cell[:1] == "(" and cell[-1:] == ")" and cell.count(",") == size - 1 and "_" not in cell
+    if all(map(is_plain, cells)):
         try:
             return np.array(",".join(cell[1:-1] for cell in cells).split(","), np.float64).reshape(-1, size), is_bad
         except ValueError:

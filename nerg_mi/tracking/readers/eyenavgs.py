@@ -20,6 +20,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError, parameter, sanitize
 from nerg_mi.files.safe_read import resolve_path
+from nerg_mi.files.values import parse_float
 
 from . import poses
 from .base import FROM_RECORDINGS, OPENGL, FixedFrameReader, RaysBuilder, Signature, option
@@ -90,7 +91,7 @@ def read_scene_settings(path: Path) -> dict[str, SceneSetting]:
 def _parse_numbers(text: str, count: int) -> tuple[float, ...] | None:
     """Parse the numbers in a cell such as ``0, 1.15, 0``; None for another number of them, or too large ones."""
     try:
-        numbers = tuple(float(word) for word in text.split(","))
+        numbers = tuple(parse_float(word) for word in text.split(","))
     except ValueError:
         return None
     return numbers if len(numbers) == count and all(abs(v) < 1e6 for v in numbers) else None

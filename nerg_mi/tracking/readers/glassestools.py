@@ -15,6 +15,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.files.safe_read import read_bytes, resolve_path
+from nerg_mi.files.values import parse_float
 
 from .base import FROM_DOCUMENTATION, RaysBuilder, Signature
 from .scene_glasses import POSE_OPTIONS, POSE_QUESTION, GazeBlock, Recording, SceneCamera, SceneReader
@@ -84,7 +85,7 @@ def _read_camera(folder: Path, builder: RaysBuilder) -> SceneCamera:
 def _parse_matrix(text: str, name: str, path: Path) -> list[float] | None:
     match = re.search(_MATRIX.format(name), text)
     try:
-        return None if match is None else [float(word) for word in match.group(1).split()]
+        return None if match is None else [parse_float(word) for word in match.group(1).split()]
     except ValueError:
         raise NergError(
             f'{name} in "{path}" contains a value that is not a number; calibrate the camera again'

@@ -215,6 +215,8 @@ def _make_rotations(is_valid: np.ndarray | np.bool_, values: np.ndarray, make) -
 _FILL_VALUES = np.array(
     [
         *(0.0, -1.0, *(sign * 10.0**k - sign for k in range(2, 7) for sign in (1, -1))),
+        *(sign * 10.0**k for k in range(5, 13) for sign in (1, -1)),
+        *(65504.0, -65504.0),  # the largest of a float of 16 bits
         *(limit for bits in (16, 32) for limit in (-(2.0 ** (bits - 1)), 2.0 ** (bits - 1) - 1, 2.0**bits - 1)),
     ]
 )

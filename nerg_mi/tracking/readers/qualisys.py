@@ -18,6 +18,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError, parameter, sanitize
 from nerg_mi.files.safe_read import BadLineCallback, read_line_blocks, resolve_path
+from nerg_mi.files.values import parse_float
 
 from .base import FROM_DOCUMENTATION, RaysBuilder, Signature, TrackingFrame, option
 from .cells import is_missing
@@ -147,7 +148,7 @@ def _split_cells(line: str) -> list[str]:
 
 
 def _parse_number(cell: str) -> float:
-    return np.nan if is_missing(cell) else float(cell)
+    return np.nan if is_missing(cell) else parse_float(cell)
 
 
 # ---- Readers ----

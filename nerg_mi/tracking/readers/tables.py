@@ -34,7 +34,7 @@ import numpy as np
 from nerg_mi.errors import NergError, parameter, sanitize
 from nerg_mi.files.safe_read import BadLineCallback, read_line_blocks, translate_read_errors
 from nerg_mi.files.tables import SEPARATOR_LINE, find_separator
-from nerg_mi.files.values import find_name, to_name, to_numbers, to_seconds
+from nerg_mi.files.values import find_name, parse_float, to_name, to_numbers, to_seconds
 from nerg_mi.tracking.rays import open_parquet
 
 from .cells import AXES, MISSING_WORDS, count_components, is_missing, parse_vectors, quote_vectors
@@ -574,7 +574,7 @@ def _parse_number(word: str, k: int, layout: _Layout) -> float | None:
         # A point would be a second decimal sign, or a thousands separator.
         word = "" if "." in word else word.replace(",", ".", 1)
     try:
-        return float(word)
+        return parse_float(word)
     except ValueError:
         return None
 

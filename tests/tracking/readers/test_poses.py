@@ -160,7 +160,11 @@ def test_azimuths_turn_right_in_every_frame():
 
 
 @pytest.mark.parametrize(
-    "fill", [0, -1, 9999, -99, -32768, 32767, 65535, -2147483648, 4294967295, -999999, 3.402823e38, -3.4028235e38]
+    "fill",
+    [
+        *(0, -1, 9999, -99, -32768, 32767, 65535, -2147483648, 4294967295, -999999, 3.402823e38, -3.4028235e38),
+        *(65504, 1e5, 1e10, -1e11),
+    ],
 )
 def test_fill_values(fill):
     v = np.array([[fill] * 3, [fill, fill, 0.5], [0.5] * 3, [np.inf] * 3, [fill, fill, fill + 1e-9]], float)

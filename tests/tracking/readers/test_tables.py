@@ -466,6 +466,15 @@ def test_other_cells_are_no_vectors(cell):
     assert parse_vector(cell) is None
 
 
+@pytest.mark.parametrize("cell", ["1_5", "(1_5, 2, 3)", "(1, 2_0, 3)"])
+def test_digits_joined_by_underscores_are_no_number(tmp_path, cell):
+    """They name a trial, such as the fifth one of participant 1; Python takes them for 15."""
+    names, good = (["p.x", "p.y", "p.z"], "(4, 5, 6)") if "(" in cell else (["p"], "4")
+    (tmp_path / "t.csv").write_text(f'p,s\n"{good}",x\n"{cell}",x\n')
+    with pytest.raises(NergError, match="line 3, column 'p'"):
+        read(tmp_path / "t.csv", names)
+
+
 def test_cells_with_other_vectors_are_refused_by_line(tmp_path):
     rows = ['"(1, 2, 3)"', '"(1, 2, 3, 4)"', "7", '"(5, 6, 7)"']
     (tmp_path / "t.csv").write_text("p,s\n" + "".join(f"{row},x\n" for row in rows))
