@@ -29,6 +29,9 @@ from nerg_mi.tracking.rays import Rays
 #
 # Gaze is evaluated in all directions from positions where participants stood. Coordinates are those of the scene.
 
+RAYS = 50_000
+"""Maximum number of samples whose hits are assigned to AOIs."""
+
 _GOLDEN_RATIO = (math.sqrt(5) - 1) / 2
 # Number of directions for the normalisation of a field. Attention shares are divided by their sum, so few are enough.
 _NORMALIZATION_DIRECTIONS = 2048

@@ -42,6 +42,7 @@ from nerg_mi.transport.geometry import SceneGeometry
 from nerg_mi.transport.observer import sensor_center
 
 from .data import (
+    RAYS,
     EyePositions,
     ObjectAttention,
     ParticipantLabels,
@@ -70,9 +71,6 @@ VIEWS = ("camera", "own", "sphere")
 
 OBSERVERS = 5
 """Number of observers with gaze in the 3D view."""
-
-RAYS = 50_000
-"""Maximum number of rays whose hits are assigned to AOIs."""
 
 _ROLES = {"field": "radiance field", "hits": "hit points"}
 _IN_MEMORY = "in memory"

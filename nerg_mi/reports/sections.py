@@ -23,7 +23,7 @@ from nerg_mi.tracking_kinds import read_tracking
 from nerg_mi.train.trainer import use_current_names
 
 from .charts import Point, interval_chart
-from .data import MeanShare, ObjectAttention, Run
+from .data import RAYS, MeanShare, ObjectAttention, Run
 
 # ---- Section ----
 
@@ -193,13 +193,14 @@ def _objects_text(run: Run, recorded: bool) -> str:
         if run.min_participants > 1
         else ""
     )
+    count = 0 if run.rays is None else len(run.rays)
+    subset = f" (of {RAYS:,} of the {count:,} samples, evenly spaced)" if count > RAYS else ""
     return (
         f"Predicted share of gaze on each AOI, averaged over {run.num_viewpoints} viewpoints of the "
-        "participants, and the share "
-        "of the recorded gaze samples that hit the AOI. Every participant has the same weight; brackets are 95 % "
-        "confidence intervals over participants. A participant has a view of an AOI if it is visible from one of their "
-        "viewpoints, or if one of their samples hits it. The field is smooth, so it may underestimate the share of "
-        f"small AOIs that attract many samples.{hidden_note}"
+        f"participants, and the share of the recorded gaze samples that hit the AOI{subset}. Every participant has the "
+        "same weight; brackets are 95 % confidence intervals over participants. A participant has a view of an AOI if "
+        "it is visible from one of their viewpoints, or if one of their samples hits it. The field is smooth, so it "
+        f"may underestimate the share of small AOIs that attract many samples.{hidden_note}"
     )
 
 

@@ -15,6 +15,7 @@ import pytest
 
 from nerg_mi.files import html
 from nerg_mi.reports.charts import Point, interval_chart, nice_ticks
+from nerg_mi.reports.data import RAYS
 from nerg_mi.reports.sections import SECTIONS, SETTINGS, render_page
 from nerg_mi.tracking.rays import TRACKING
 from tests.reports.made import HOSTILE, PNG, full_run, minimal_run, packed_scene
@@ -235,6 +236,16 @@ def test_shares_of_few_participants_are_hidden():
     said = text_of(objects, replace(full_run(), min_participants=3))
     assert "otherhidden" in said and "fewer than 3" in said and said.count("25.00") == 2
     assert "hidden" not in text_of(objects, full_run())
+
+
+def test_shares_of_a_part_of_the_samples_say_so():
+    """Their numbers differ from those of statistics, which are of all samples."""
+    objects, rays = next(s for s in SECTIONS if s.name == "objects"), full_run().rays
+    for count in (RAYS, RAYS + 1):
+        many = rays.select(np.arange(count) % len(rays))
+        assert (f"of {RAYS:,} of the {count:,} samples" in text_of(objects, replace(full_run(), rays=many))) == (
+            count > RAYS
+        )
 
 
 def test_shares_without_participants_have_no_intervals():
