@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import platform
 import subprocess
@@ -9,6 +10,7 @@ import sys
 
 import pytest
 
+from tests.conftest import ROOT
 from tools.other_processor import VARIABLE, make_environment
 
 pytestmark = pytest.mark.skipif(
@@ -41,3 +43,14 @@ values.append(dr.sin(dr.linspace(mi.Float, 0, 9, 99)).numpy())
 print(abs(values[0] - values[1]).max())
 """
     assert float(run(code)[-1]) < 1e-6
+
+
+def test_the_lint_finds_equality_of_computed_numbers():
+    """In tests only: the package compares settings."""
+    pytest.importorskip("ruff")
+    code = "def test_unit():\n    assert sum([0.1, 0.9]) * 2 == 2.0\n"
+    for folder, is_checked in (("tests/photos", True), ("nerg_mi/photos", False)):
+        line = [sys.executable, "-m", "ruff", "check", "--output-format", "json", "--stdin-filename"]
+        line += [f"{folder}/test_unit.py", "-"]
+        done = subprocess.run(line, input=code, cwd=ROOT, capture_output=True, text=True)
+        assert [finding["code"] for finding in json.loads(done.stdout)] == ["RUF069"] * is_checked, done.stderr

@@ -7,6 +7,7 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.figures.scanpath import draw_scanpath
+from nerg_mi.tracking.event_settings import EventRules
 from nerg_mi.tracking.rays import Rays
 from tests.figures.test_floor_plans import WALLS_SCENE
 from tests.recorder import Recorder
@@ -39,6 +40,8 @@ def test_fixations_are_numbered_where_they_are(rgb, tmp_path):
     magnification = np.ptp(axes.get_xlim()) / 60
     assert magnification == 1 and np.allclose([t.xy for t in axes.texts[:2]], expected, atol=0.05)
     assert "1 outside of the image or hidden" in " ".join(axes.figure.texts[0].get_text().split())
+    slow = draw_scanpath(*files, spp=2, rules=EventRules(pursuit_velocity=60.0)).axes[0]
+    assert [text for text in (t.get_text() for t in slow.texts) if text.isdecimal()] == ["1", "3", "4"]
     for refused, said in (({"persons": ["Eve"]}, "Eve"), ({"start": 9.0}, "start"), ({"sensor": 1}, "1 sensor")):
         with pytest.raises(NergError, match=said):
             draw_scanpath(*files, **refused)

@@ -92,6 +92,15 @@ def test_fixations_are_those_of_other_exports(rgb, folder, monkeypatch):
     assert fixations.kinds.tolist() == ["fixation"] and np.isclose(fixations.durations[0], 1, atol=0.02)
     assert sum(counts.get(kind, 0) for kind in FIXATIONS) == 1 and counts["smooth_pursuit"] == 1
     assert fixations.definition == EventRules().describe()
+    # By other rules the pursuit is a fixation, in both.
+    rules = EventRules(pursuit_velocity=40.0)
+    scene, _ = exported(folder, "moving.npz", monkeypatch=monkeypatch, rules=rules)
+    counts = export_rays(moving, folder / "other", rules=rules).events
+    (fixations,) = scene.fixations
+    assert (
+        len(fixations.times) == sum(counts.get(kind, 0) for kind in FIXATIONS) == 2 and "smooth_pursuit" not in counts
+    )
+    assert fixations.definition == rules.describe()
 
 
 def test_heads_have_no_fixations_and_are_named(rgb, folder, monkeypatch):
