@@ -132,7 +132,7 @@ def make_command(row: Row) -> Command:
             result.wait()
         if row.prints:
             for part in result if isinstance(result, list) else [result]:
-                reporter.message(str(part))
+                reporter.message(part.to_text())
         if row.several:
             written = [cast("Any", result).save(path) for path in written]
         elif paths:

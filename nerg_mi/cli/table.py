@@ -27,9 +27,9 @@ class Row:
     ``--threads``. ``spellings`` are those of options that have more than their name. ``groups`` are the headings of
     help under which keywords are listed, those that are not named under the first. A command is ``without`` the options
     of these parameters and fields, which only developers and experts set, in Python. A command that
-    ``prints`` its result, or each element of a list, needs no output. A command with ``presets`` has the options of all
-    readers of tracking files (`.presets`). The result of a command that ``waits`` serves until Ctrl-C (its method
-    ``wait``).
+    ``prints`` its result, a list of reports (their method ``to_text``), needs no output. A command with ``presets`` has
+    the options of all readers of tracking files (`.presets`). The result of a command that ``waits`` serves until
+    Ctrl-C (its method ``wait``).
     """
 
     name: str

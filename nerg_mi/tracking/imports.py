@@ -300,7 +300,7 @@ def _transform_to_files(rays: Rays) -> list[list[float]]:
 
 def _print_report(report: QualityReport, aliases: dict[str, str], reporter: Reporter) -> None:
     """Print the report, and names of files by those of their ``aliases`` that it shows; no file contains them."""
-    text = str(report)
+    text = report.to_text()
     reporter.message(text)
     unwrapped = "".join(text.split())
     for alias, file in aliases.items():

@@ -234,8 +234,8 @@ class QualityReport:
             *self.notes
         ]
 
-    def __str__(self) -> str:
-        """The report as a table for the terminal, with warnings at the end."""
+    def to_text(self) -> str:
+        """Return the report as a table, with warnings at the end, for a reporter, which spells the parameters."""
         from rich.console import Console
         from rich.markup import escape
         from rich.table import Table
@@ -253,7 +253,7 @@ class QualityReport:
         return capture.get().removesuffix("\n")
 
     def __repr__(self) -> str:
-        return clean_text(str(self))
+        return clean_text(self.to_text())
 
     def _repr_html_(self) -> str:
         return key_value_table(self.lines)

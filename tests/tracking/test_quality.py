@@ -1,15 +1,18 @@
 """Tests of `nerg_mi.tracking.quality`."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from nerg_mi.errors import NergError, clean_text
+from nerg_mi.errors import NergError, clean_text, spell_command_line
 from nerg_mi.tracking import quality
 from nerg_mi.tracking.events import angles_about, detect_events
 from nerg_mi.tracking.quality import (
     WARNING_LABEL,
     GazeTarget,
     QualityReport,
+    check_rays,
     make_quality_report,
     measure_recordings,
     summarise,
@@ -74,6 +77,13 @@ def test_names_are_not_interpreted_as_markup():
     rays = Rays(np.arange(3.0), [0, 0, 1], ("[red]", "[/b]"), both_eyes, ahead, np.ones(3))
     shown = str(QualityReport(rays, "[bold].npz", summarise(rays)))
     assert "[bold].npz" in shown and "[red]" in shown and "[/b]" in shown
+
+
+def test_printed_reports_spell_parameters_for_their_reader():
+    report = check_rays(replace(walk(), t=1000 * walk().t))  # milliseconds as seconds
+    assert any("unit of time" in warning for warning in report.warnings)
+    assert "(tick=" in str(report) and str(report) == repr(report) == clean_text(str(report))
+    assert "(--tick " in clean_text(report.to_text(), spell_command_line)
 
 
 # ---- Summary ----
