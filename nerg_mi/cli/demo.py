@@ -35,7 +35,7 @@ from nerg_mi.interruption import Interruption
 from nerg_mi.progress import Progress, Reporter, SilentReporter, open_reporter
 from nerg_mi.ranges import SEEDS, SPP, Range, check_ranges
 from nerg_mi.reports.inputs import RESULTS
-from nerg_mi.reports.report import ReportSettings, make_report
+from nerg_mi.reports.report import report
 from nerg_mi.scenes.store import SCENE_FILE  # pyright: ignore[reportMissingImports] at the root of a checkout
 from nerg_mi.surfaces.bake import bake
 from nerg_mi.surfaces.settings import BakeSampling
@@ -216,7 +216,10 @@ def _render_demo(
     clock.start("report")
     # The AOIs are next to the scene file.
     objects = scene.parent / OBJECTS
-    shown = ReportSettings(
+    rendered = {"camera": camera, "own": own_view, "sphere": sphere}
+    evaluation = find_evaluation(scene, inputs[2])
+    made = report(
+        [*inputs[1:], *tracked, *evaluation],
         aois=objects if objects.is_file() else None,
         observer=eye,
         **_camera_of(seen.sensors()[CAMERA]),
@@ -225,11 +228,9 @@ def _render_demo(
         max_points=REPORT_POINTS,
         seed=seed,
         title="The demo store and its shoppers" if scene == SCENE_FILE else None,
+        rendered=rendered,
+        progress=_StageReporter(clock),
     )
-    rendered = {"camera": camera, "own": own_view, "sphere": sphere}
-    evaluation = find_evaluation(scene, inputs[2])
-    files_shown = [*inputs[1:], *tracked, *evaluation]
-    made = make_report(files_shown, shown, _StageReporter(clock), rendered)
     files.append(made.save(output / "report.html"))
     if made.run.observed_objects:
         rows = [{"object": o.name, "observer_share": round(o.predicted.mean, 6)} for o in made.run.observed_objects]
@@ -237,7 +238,7 @@ def _render_demo(
         files.append(output / "aoi.csv")
     clock.stop()
 
-    report = {
+    summary = {
         "command": "nerg demo",
         "versions": list_library_versions(mode),
         "variant": mode,
@@ -251,13 +252,13 @@ def _render_demo(
         "inputs": {p.name: file_sha256(p) for p in [*inputs, *evaluation]},
         "outputs": {p.name: file_sha256(p) for p in files},
     }
-    write_json(output / "run.json", report)
+    write_json(output / "run.json", summary)
     files.append(output / "run.json")
     for path in files:
         reporter.message(f"wrote {path}")
     for results, verdict in made.run.verdicts:
         reporter.message(explain_verdict(verdict, results.split))
-    return DemoResult(files, clock.seconds, report)
+    return DemoResult(files, clock.seconds, summary)
 
 
 def _viewer(page: Path) -> str:

@@ -466,7 +466,7 @@ TABLE = (
         "File to write (.html).",
         (".html", ".htm"),
         fastest=True,
-        without=("seed", "fov", "viewpoints", "max_points", "spp"),
+        without=("seed", "fov", "viewpoints", "max_points", "spp", "rendered"),
     ),
     Row(
         "study",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -103,23 +103,21 @@ class Report:
 
 @dataclass(frozen=True, kw_only=True)
 class ReportSettings:
-    """Content of a report; the fields are the keywords of `report`."""
+    """What a report shows, and how: keywords of `report`, which describes them."""
 
-    aois: FilePath | AnyAreas | None = None
-    evaluate: bool = False
-    observer: Sequence[float] | None = None
-    camera: Sequence[float] | None = None
-    target: Sequence[float] | None = None
-    fov: float | None = None
-    viewpoints: int = 200
-    min_participants: int = 1
-    show_names: bool = False
-    paths: bool = True
-    title: str | None = None
-    width: int = 480
-    spp: int = 2
-    max_points: int = 80_000
-    seed: int = 0
+    observer: Sequence[float] | None
+    camera: Sequence[float] | None
+    target: Sequence[float] | None
+    fov: float | None
+    viewpoints: int
+    min_participants: int
+    show_names: bool
+    paths: bool
+    title: str | None
+    width: int
+    spp: int
+    max_points: int
+    seed: int
 
     def describe(self) -> dict[str, str]:
         """Return the settings that the report lists, by their names."""
@@ -152,6 +150,7 @@ def report(
     spp: Annotated[int, SPP] = 2,
     max_points: Annotated[int, Range(100, 100_000)] = 80_000,
     seed: Annotated[int, SEEDS] = 0,
+    rendered: Mapping[str, Any] | None = None,
     progress: Progress = None,
 ) -> Report:
     """Write a report on a gaze field: one HTML file that opens from disk and needs no network.
@@ -195,6 +194,8 @@ def report(
         Maximum number of points in the 3D view.
     seed : int
         Seed of the random numbers for sampling.
+    rendered : mapping, optional
+        Channels of the images camera, own and sphere, if they have been rendered for this observer and camera.
     progress : bool, Reporter or None
         Progress and messages (`nerg_mi.progress.Progress`).
 
@@ -217,50 +218,24 @@ def report(
     >>> made.save(folder / "report.html").name
     'report.html'
     """
-    settings = ReportSettings(
-        aois=aois,
-        evaluate=evaluate,
-        observer=observer,
-        camera=camera,
-        target=target,
-        fov=fov,
-        viewpoints=viewpoints,
-        min_participants=min_participants,
-        show_names=show_names,
-        paths=paths,
-        title=title,
-        width=width,
-        spp=spp,
-        max_points=max_points,
-        seed=seed,
-    )
+    keywords = dict(locals())
+    settings = ReportSettings(**{field.name: keywords[field.name] for field in fields(ReportSettings)})
     with open_reporter(progress) as reporter:
-        return make_report(inputs, settings, reporter)
-
-
-def make_report(
-    inputs: Any, settings: ReportSettings, reporter: Reporter, rendered: Mapping[str, Channels] | None = None
-) -> Report:
-    """Make a report, as `report` does.
-
-    ``rendered`` are images that have been rendered already, for the observer and camera of ``settings``: "camera",
-    "own" and "sphere".
-    """
-    sources = open_inputs(inputs, reporter)
-    areas = Areas(()) if settings.aois is None else _open_boxes(settings.aois, reporter)
-    results, doubts = open_evaluations(sources)
-    activate_mitsuba()
-    if settings.evaluate:
-        results += compute_evaluations(sources, settings.seed, results, reporter)
-    with Interruption() as stop:
-        run = ReportBuilder(sources, settings, reporter, stop).build(areas, results, doubts, rendered)
-    for _, verdict in run.verdicts:
-        reporter.message(verdict.sentence)
-    if not run.results:
-        reporter.message(
-            f"there is no evaluation, so the report has no verdict; add {parameter('evaluate', True)} to compute "
-            "one from rays"
-        )
+        sources = open_inputs(inputs, reporter)
+        areas = Areas(()) if aois is None else _open_boxes(aois, reporter)
+        results, doubts = open_evaluations(sources)
+        activate_mitsuba()
+        if evaluate:
+            results += compute_evaluations(sources, seed, results, reporter)
+        with Interruption() as stop:
+            run = ReportBuilder(sources, settings, reporter, stop).build(areas, results, doubts, rendered)
+        for _, verdict in run.verdicts:
+            reporter.message(verdict.sentence)
+        if not run.results:
+            reporter.message(
+                f"there is no evaluation, so the report has no verdict; add {parameter('evaluate', True)} to compute "
+                "one from rays"
+            )
     return Report(run)
 
 

@@ -14,11 +14,10 @@ from nerg_mi.environment.gaze import GazeField
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation.gaze_report import write_report
 from nerg_mi.files.atomic import file_sha256
-from nerg_mi.progress import SILENT
 from nerg_mi.reports import inputs
 from nerg_mi.reports import report as report_module
 from nerg_mi.reports.data import Run
-from nerg_mi.reports.report import Report, ReportBuilder, ReportSettings, make_report, report
+from nerg_mi.reports.report import Report, ReportBuilder, report
 from nerg_mi.tracking.rays import Rays
 from nerg_mi.train.gaze import train_gaze
 from tests.evaluation.test_gaze import crowd
@@ -231,7 +230,7 @@ def test_existing_images_are_not_rendered_again(run, monkeypatch):
         raise AssertionError("rendered again")
 
     monkeypatch.setattr(report_module, "render_channels", never)
-    assert make_report(run / "gaze.safetensors", ReportSettings(**SMALL), SILENT, rendered).html == one
+    assert report(run / "gaze.safetensors", **SMALL, rendered=rendered).html == one
 
 
 def test_pages_have_their_suffix(run, tmp_path):
