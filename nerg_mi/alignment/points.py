@@ -166,7 +166,7 @@ def read_cameras(tracking: Photos | FilePath, environment: Photos | FilePath) ->
     """
     models = [Photos.open(photos) for photos in (tracking, environment)]
     for key in (_path_key, _name_key):
-        tables = [_poses_by_name(model, key) for model in models]
+        tables = [{key(frame.name): frame.to_world for frame in model.frames} for model in models]
         common = sorted(set(tables[0]) & set(tables[1]))
         if len(common) >= 2:
             a, b = (np.stack([t[name] for name in common]) for t in tables)
@@ -176,10 +176,6 @@ def read_cameras(tracking: Photos | FilePath, environment: Photos | FilePath) ->
         f'"{models[0].path}" and "{models[1].path}" have fewer than two photos with the same name; give two models '
         "of the same photos"
     )
-
-
-def _poses_by_name(model: Photos, key) -> dict[str, np.ndarray]:
-    return {key(f.name): f.to_world for f in model.frames}
 
 
 def _path_key(name: str) -> str:

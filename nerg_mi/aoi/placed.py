@@ -312,13 +312,6 @@ class HitAssignment:
     rows: tuple[np.ndarray, ...]
     distance: tuple[np.ndarray, ...]
 
-    def to_matrix(self) -> np.ndarray:
-        """Return a boolean matrix (N, K): whether each sample hits each AOI."""
-        matrix = np.zeros((self.count, len(self.rows)), bool)
-        for k, rows in enumerate(self.rows):
-            matrix[rows, k] = True
-        return matrix
-
 
 def assign_hits(
     aois: Sequence[Aoi],

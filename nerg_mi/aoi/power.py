@@ -154,10 +154,6 @@ def power_rows(
                         simulations=simulations,
                         seed=seed,
                     )
-                row |= {f"power_{n}": _finite_or_none(p) for n, p in zip(PARTICIPANT_COUNTS, power)}
+                row |= {f"power_{n}": float(p) if np.isfinite(p) else None for n, p in zip(PARTICIPANT_COUNTS, power)}
                 rows.append(row | {"note": note})
     return rows
-
-
-def _finite_or_none(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None

@@ -308,7 +308,6 @@ def render_bands(
     spp: int = 0,
     seed: int = 0,
     rows: int = 0,
-    strip: int = 0,
     on_strip: Callable[[int, int], None] | None = None,
     layers: LayerSource | None = None,
     pace: SamplePace | None = None,
@@ -327,8 +326,6 @@ def render_bands(
         Seed of the rendering.
     rows : int
         Rows of a band; 0 renders all rows in one band.
-    strip : int
-        Samples of a strip; 0 adapts the number to `STRIP_SECONDS`.
     on_strip : callable, optional
         Called after each strip with the number of finished samples and of all samples. It may raise an exception.
     layers : LayerSource, optional
@@ -356,7 +353,7 @@ def render_bands(
         integrator.rendering_from(sensor, scene) if isinstance(integrator, ObserverIntegrator) else nullcontext()
     )
     base = get_base_seed(sensor.sampler())
-    pace = pace or SamplePace(strip)
+    pace = pace or SamplePace()
     pace.begin()
     done = 0
     for top in range(0, grid.height, grid.rows):

@@ -280,11 +280,6 @@ class PositionSplit:
         """Masks (N,) of training and test rays."""
         return self.train, self.test
 
-    @property
-    def is_purged(self) -> np.ndarray:
-        """Mask (N,) bool of rays on neither side."""
-        return ~(self.train | self.test)
-
 
 def split_by_position(
     rays: Rays,

@@ -212,7 +212,7 @@ class TrainingPage:
         """Record the camera of ``visitor``. If it has moved, mark its picture as outdated."""
         view, old = PinholeView.from_page(visitor.client.camera), visitor.view
         is_valid = np.isfinite(_to_numbers(view)).all() and 1 / _MAX_ASPECT < view.aspect < _MAX_ASPECT
-        if not is_valid or (old is not None and _is_same(view, old)):
+        if not is_valid or (old is not None and np.allclose(_to_numbers(view), _to_numbers(old), atol=1e-6)):
             return
         with self._lock:
             visitor.view, visitor.change_time = view, time.monotonic()
@@ -259,7 +259,3 @@ def _get_fov(camera: PosedCamera) -> float:
 
 def _to_numbers(view: PinholeView) -> list[float]:
     return [*view.origin, *view.forward, *view.up, view.fov, view.aspect]
-
-
-def _is_same(view: PinholeView, other: PinholeView) -> bool:
-    return np.allclose(_to_numbers(view), _to_numbers(other), atol=1e-6)

@@ -72,8 +72,8 @@ def render_undivided(mi, scene, spp, seed=3):
     return np.array(scene.sensors()[0].film().bitmap())
 
 
-def render_divided(scene, spp, seed=3, **kwargs):
-    parts = bands.render_bands(scene, scene.sensors()[0], spp=spp, seed=seed, **kwargs)
+def render_divided(scene, spp, seed=3, strip=0, **kwargs):
+    parts = bands.render_bands(scene, scene.sensors()[0], spp=spp, seed=seed, pace=bands.SamplePace(strip), **kwargs)
     return np.concatenate([np.array(band.film.bitmap())[: band.rows] for band in parts])
 
 

@@ -257,8 +257,7 @@ def test_train_and_test_probes_share_no_ray(rays_splits):
     distances = np.linalg.norm(rays_splits.origin[split.train][:, None] - split.test_centres[None], axis=2)
     assert distances.min() > 2 * R
     within = np.linalg.norm(rays_splits.origin[:, None] - split.test_centres[None], axis=2).min(axis=1)
-    assert np.array_equal(split.test, within <= R) and np.array_equal(split.is_purged, (within > R) & (within <= 2 * R))
-    assert not (split.train & split.test).any() and (split.train | split.test | split.is_purged).all()
+    assert np.array_equal(split.test, within <= R) and np.array_equal(split.train, within > 2 * R)
 
 
 def test_zones_are_separate_and_repeatable(rays_splits):
