@@ -18,7 +18,7 @@ from nerg_mi.files.tables import format_markdown_table, write_csv, write_json
 from nerg_mi.maths.sphere import Z_UP, latlong_grid
 from nerg_mi.tracking.probes import REGION_LEVELS, format_level
 
-from .baselines import CONDITIONAL_KDE, NEAREST_RAYS, PRIOR, REAIMED_HITS, UNIFORM, Baseline
+from .baselines import CONDITIONAL_HITS, CONDITIONAL_KDE, NEAREST_RAYS, PRIOR, REAIMED_HITS, STACK, UNIFORM, Baseline
 from .gaze import MAP_SCORES, SCORES, SPLIT_HALF, GazeTest, find_split_half_fault
 from .uncertainty import RETAINED_FRACTIONS
 
@@ -325,6 +325,8 @@ _BASELINE_NAMES = {
     NEAREST_RAYS: "the nearest rays",
     CONDITIONAL_KDE: f"the {CONDITIONAL_KDE}",
     REAIMED_HITS: f"the {REAIMED_HITS}",
+    CONDITIONAL_HITS: f"the {CONDITIONAL_HITS}",
+    STACK: "the stack of kernels",
 }
 _OLD_METHODS = {"position-blind": PRIOR, "4,096 nearest rays": NEAREST_RAYS}  # In files of earlier versions
 
