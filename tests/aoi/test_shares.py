@@ -125,6 +125,24 @@ def test_coarse_shares_of_many_areas_need_few_directions():
     assert np.abs(shares.share / fine.share - 1)[is_visible].max() < 0.1 and is_visible.any()
 
 
+@pytest.mark.nightly
+def test_errors_of_thin_areas_are_maximum_errors():
+    """Stripes of 2 mm on the wall, thinner than the spacing of the directions, which meet them at random. Errors from
+    the scatter alone are exceeded up to twice."""
+    rng = np.random.default_rng(1)
+    stripes = []
+    for _ in range(40):
+        y, z = rng.uniform(-4, 4), rng.uniform(0.2, 1.5)
+        region = Region.create("stripe", (1.99, y, z), (2.01, y + 0.002, z + rng.uniform(0.3, 1.2)))
+        stripes.append(BoxAoi(region))
+    members = [(k,) for k in range(len(stripes))]
+    coarse, fine = (
+        gaze_shares(Hall().query_from, OBSERVERS, stripes, members, 0.0, rule)
+        for rule in (COARSE, SummationRule(rtol=1e-3, atol=1e-6))
+    )
+    assert (fine.share > 0).all() and (np.abs(coarse.share - fine.share) <= coarse.error).all()
+
+
 def test_empty_inputs():
     shares = gaze_shares(Hall().query_from, OBSERVERS, [], [], 0.0)
     assert shares.share.shape == (2, 0) and (shares.integral > 0).all()

@@ -667,7 +667,8 @@ def _to_numbers(path: str | os.PathLike, name: str, column: Any, days: DayCounte
         return to_numbers(values, name, flags=True)
     except (TypeError, ValueError):
         raise NergError(
-            f'the column {sanitize(name, 40)!r} of the table "{path}" does not contain numbers; use another column'
+            f'the column {sanitize(name, 40)!r} of the table "{path}" does not contain numbers; convert it, or '
+            "use another column"
         ) from None
 
 
