@@ -68,7 +68,8 @@ def iter_folds(
     for k, group in enumerate(groups):
         is_held_out = np.isin(rays.person, group)
         is_training = ~is_held_out if participants else np.ones(len(rays), bool)
-        if positions or not participants:
+        # A single fold holds out everybody.
+        if is_training.any() and (positions or not participants):
             is_training &= ~_find_zones(rays.origin, is_held_out, is_training, radius, 1000 * seed + k)
         if is_training.sum() < _MIN_RAYS:
             continue

@@ -79,3 +79,7 @@ def test_samples_have_the_same_number_of_rays_of_each_participant(count):
     drawn = sample_participants_equally(few, count)
     counts = np.bincount(drawn.person)
     assert len(drawn) == min(count, len(few)) and (count > 100 or counts.max() < 2.5 * counts.min())
+
+
+def test_a_single_fold_of_participants_has_no_training_rays():
+    assert list(iter_folds(walkers(), RADIUS, 1)) == []
