@@ -16,19 +16,17 @@ TESTS = (
     "alignment",
     "aoi",
     "api",
+    "environment",
     "evaluation",
     "fields",
     "files",
     "formats",
     "maths",
-    "measures",
     "photos",
     "plugins/test_nerg.py",
-    "probes",
-    "rays",
     "surfaces",
+    "tracking",
     "transport",
-    "workflows/test_statistics.py",
 )
 """Below tests/: those that ask for nothing of the checkout but its test data."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
 import importlib.metadata
 import os
@@ -498,6 +499,17 @@ def test_all_packages_are_installed():
 
 OF_EXTRAS = {"c3d", "dask", "distributed", "pyarrow", "pycolmap", "torch", "viser", "websockets", "xarray"}
 """Libraries whose absence is named where they are imported."""
+
+
+def test_the_package_is_tried_with_tests_that_exist():
+    # Other names end the session before any test.
+    text = (ROOT / "noxfile.py").read_text(encoding="utf-8")
+    (names,) = (ast.literal_eval(n.value) for n in ast.parse(text).body if _assigns(n, "TESTS"))
+    assert len(names) > 5 and all((ROOT / "tests" / name).exists() for name in names)
+
+
+def _assigns(node: ast.stmt, name: str) -> bool:
+    return isinstance(node, ast.Assign) and [ast.unparse(target) for target in node.targets] == [name]
 
 
 def test_libraries_of_the_core_are_dependencies():
