@@ -53,8 +53,11 @@ def fit_sparse_weights(log_densities: np.ndarray, participant: np.ndarray) -> np
     hits = np.arange(2, len(log_densities))
     fit = lambda hits: fit_weights(log_densities[[0, 1, *hits]], participant, _make_pseudo_rays(len(hits)))
     fitted = fit(hits)
-    hits = hits[np.argsort(-fitted[2:], kind="stable")[:MAX_KERNELS]]
-    hits = hits[fit(hits)[2:] >= _MIN_WEIGHT]
+    # One by one, because the weight of a kernel moves to those that resemble it. The largest ones may all be alike.
+    while len(hits) > MAX_KERNELS:
+        hits = np.delete(hits, fitted[2:].argmin())
+        fitted = fit(hits)
+    hits = hits[fitted[2:] >= _MIN_WEIGHT]
     fitted = fit(hits)
     weights = np.zeros(len(log_densities))
     weights[[0, 1, *hits]] = fitted

@@ -41,6 +41,10 @@ def test_few_kernels_have_weight():
     weights = fit_sparse_weights(log, participant)
     assert np.flatnonzero(weights).tolist() == [0, 1, 9, 30] and weights.sum() == pytest.approx(1)
     np.testing.assert_allclose(weights[[9, 30]], 0.25, atol=0.06)
+    # Ten kernels that are alike do not displace another.
+    alike = log.copy()
+    alike[9:19] = log[9]
+    assert set(np.flatnonzero(fit_sparse_weights(alike, participant))) > {0, 1, 30}
     # Many equal kernels, and none
     assert np.count_nonzero(fit_sparse_weights(np.zeros((38, 800)), participant)) == 2 + MAX_KERNELS
     useless = np.where(np.arange(38)[:, None] < 2, 0.0, -9.0) * np.ones(800)
