@@ -149,9 +149,10 @@ def test_scores_and_pictures_of_views(fog, tmp_path):
     assert scores.depth.outlier_fraction == 0 and scores.depth.median < 0.02
     # Views of equal names have a picture each.
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["frame-2.png", "frame.png"]
-    written = json.loads(json.dumps(scores.to_dict()))
+    written = json.loads(scores.save(tmp_path / "scores.json").read_text())
     assert written["psnr_mean"] == scores.psnr_mean and written["depth"]["median"] == scores.depth.median
-    assert "depth" not in score_views(fog, [PhotoView("frame.png", view.camera, view.color)]).to_dict()
+    without = score_views(fog, [PhotoView("frame.png", view.camera, view.color)])
+    assert "depth" not in json.loads(without.save(tmp_path / "scores.json").read_text())
     with pytest.raises(ValueError, match="holdout"):
         score_views(fog, [])
 
