@@ -11,9 +11,9 @@ from __future__ import annotations
 import numpy as np
 
 _RAYS_PER_PARTICIPANT = 5.0  # Independent rays that a participant counts as
-_NUM_PSEUDO_RAYS = 60.0
+_NUM_PSEUDO_RAYS = 5.0
 # Fractions of the pseudo-rays; that of the hits is divided between their kernels
-_FIELD, _PRIOR, _HITS = 0.55, 0.25, 0.20
+_FIELD, _PRIOR, _HITS = 0.85, 0.10, 0.05
 MAX_KERNELS = 6  # Maximum number of kernels of re-aimed hits in a mixture, because each costs time
 _MIN_WEIGHT = 0.02  # Minimum weight of a kernel, for the same reason
 _MAX_ITERATIONS, _TOLERANCE = 2000, 1e-6

@@ -45,8 +45,9 @@ def test_few_kernels_have_weight():
     alike = log.copy()
     alike[9:19] = log[9]
     assert set(np.flatnonzero(fit_sparse_weights(alike, participant))) > {0, 1, 30}
-    # Many equal kernels, and none
-    assert np.count_nonzero(fit_sparse_weights(np.zeros((38, 800)), participant)) == 2 + MAX_KERNELS
+    # Many equal kernels that are better than the rest, and none
+    equal = np.where(np.arange(38)[:, None] < 2, -2.0, 0.0) * np.ones(800)
+    assert np.count_nonzero(fit_sparse_weights(equal, participant)) == 2 + MAX_KERNELS
     useless = np.where(np.arange(38)[:, None] < 2, 0.0, -9.0) * np.ones(800)
     assert np.flatnonzero(fit_sparse_weights(useless, participant)).tolist() == [0, 1]
     assert np.flatnonzero(fit_sparse_weights(log[:2], participant)).tolist() == [0, 1]
