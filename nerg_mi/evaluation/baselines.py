@@ -309,10 +309,8 @@ def make_tuned_baselines(
     settings: dict[str, list[dict[str, float]]] = {}
     make_prior = lambda rays: make_prior_baseline(rays, kappa=prior_kappa, weights=compute_participant_weights(rays))
     for k, fold in enumerate(iter_folds(rays, radius, _FOLDS, seed, participants=participants, positions=positions)):
-        held_out = fold.held_out.select(fold.is_new_position) if positions else fold.held_out
-        if not len(held_out):
-            continue
-        test = sample_participants_equally(held_out, _MAX_TEST_RAYS, seed + k)
+        # At recorded and at new positions alike: settings for the few positions far from all others do worse elsewhere.
+        test = fold.sample(_MAX_TEST_RAYS, seed + k)
         prior_densities = make_prior(fold.train)(np.zeros((1, 3)), test.direction)[0]
         for name, (is_conditional, is_aimed) in kinds.items():
             scored = _score_neighbours(fold.train, test, prior_densities, is_conditional, is_aimed)

@@ -107,7 +107,8 @@ def format_verdict_table(rows: list[dict]) -> str:
         "## Recorded and new positions\n\nHeld-out participants up to, and farther than, "
         f"{NEW_POSITION_DISTANCE:g} m from every training position: bits per ray above the position-independent prior "
         "at the origin of each ray, averaged over the rays of each participant, and by how much the gaze field exceeds "
-        "each baseline, which is tuned for these positions. Brackets: 95 % intervals of Student's t over participants."
+        "each baseline, which is tuned on participants, for new positions also on zones, that are left out. Brackets: "
+        "95 % intervals of Student's t over participants."
         f"\n\n{format_table(rows, ('kind', 'method', 'people', 'rays', 'bits', 'bits.gap'))}\n"
     )
 

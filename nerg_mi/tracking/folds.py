@@ -85,14 +85,13 @@ def _find_zones(
 ) -> np.ndarray:
     """Return whether each of ``origins`` (N, 3) is in one of the zones around held-out positions.
 
-    The centres are drawn with equal probability for equal volumes, where few participants stood as well. Zones that are
-    too small to contain a new position are not made.
+    The centres are origins of held-out rays: zones where few participants stood would be large, and far from all
+    others. Zones that are too small to contain a new position are not made.
     """
     from scipy.spatial import KDTree
 
-    _, first = np.unique(np.floor(origins[is_held_out] / radius), axis=0, return_index=True)
-    cells = np.random.default_rng(seed).permutation(first)[:_NUM_ZONES]
-    distance = KDTree(origins[is_held_out][cells]).query(origins)[0]
+    centres = np.random.default_rng(seed).permutation(np.flatnonzero(is_held_out))[:_NUM_ZONES]
+    distance = KDTree(origins[centres]).query(origins)[0]
     size = np.quantile(distance[is_training], _ZONE_FRACTION, method="lower")
     return distance < size if size > radius else np.zeros(len(origins), bool)
 

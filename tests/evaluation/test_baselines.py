@@ -26,7 +26,7 @@ from nerg_mi.evaluation.baselines import (
 )
 from nerg_mi.maths import vmf
 from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.tracking.folds import iter_folds
+from nerg_mi.tracking.folds import Fold, iter_folds
 from nerg_mi.tracking.probes import compute_participant_weights
 from nerg_mi.tracking.rays import Rays
 from tests.reference.kde import kde as reference
@@ -133,17 +133,15 @@ def test_without_hit_points_there_are_no_re_aimed_hits():
 
 
 def test_folds_and_their_samples_follow_the_seed(monkeypatch):
-    rays, draw, samples = replace(room(participants=3, count=900), hit=None), baselines.sample_participants_equally, []
+    rays, draw, samples = replace(room(participants=3, count=900), hit=None), Fold.sample, []
 
-    def record(held_out: Rays, count: int, seed: int) -> Rays:
-        if count == baselines._MAX_TEST_RAYS:  # others are samples of the training rays
-            samples.append((held_out.t, seed))
-        return draw(held_out, count, seed)
+    def record(fold: Fold, count: int, seed: int) -> Rays:
+        samples.append((fold.held_out.t, seed))
+        return draw(fold, count, seed)
 
-    monkeypatch.setattr(baselines, "sample_participants_equally", record)
+    monkeypatch.setattr(Fold, "sample", record)
     assert REAIMED_HITS not in make_tuned_baselines(rays, 0.5, np.full((900, 3), np.nan), prior_kappa=10.0, seed=5)
-    new_of = lambda seed: [fold.held_out.select(fold.is_new_position).t for fold in iter_folds(rays, 0.5, 4, seed)]
-    folds, others = map(new_of, (5, 0))
+    folds, others = ([fold.held_out.t for fold in iter_folds(rays, 0.5, 4, seed)] for seed in (5, 0))
     assert len(samples) == len(folds) and not all(map(np.array_equal, folds, others))
     assert all(np.array_equal(t, fold) for (t, _), fold in zip(samples, folds))
     assert [seed for _, seed in samples] == [5 + k for k in range(len(folds))]
