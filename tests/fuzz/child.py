@@ -146,7 +146,7 @@ def attempt(reader, folder: Path) -> dict:
         outcome, said = "left a file", str(_files(folder) ^ before)
     elif taken > ROOM or "needs more memory than is available" in said:
         outcome, said = "memory", f"{taken >> 20} MB; {said}"
-    elif seconds > SECONDS * (4 if reader.is_command else 1):
+    elif seconds > SECONDS * (24 if reader.is_command else 1):
         outcome, said = "slow", f"{seconds:.1f} s; {said}"
     elif outcome == "refusal" and not (said.isprintable() and 10 < len(said) < 1500):
         outcome = "no sentence"

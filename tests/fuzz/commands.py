@@ -40,7 +40,7 @@ WORK = {"--" + name for name in _WORK.split()}
 """Options whose value is an amount of work: any in their range may be meant in earnest, and take hours. A line with one
 is interrupted after `PATIENCE` seconds of the processor, and must end then; others must be done within `LIMIT`."""
 
-PATIENCE, LIMIT = 4.0, 20.0
+PATIENCE, LIMIT = 4.0, 120.0
 
 _FILES = dict(field="field.safetensors", gaze="gaze.safetensors", scene="ball.xml", surface="room.ply", rays="rays.npz")
 _FILES |= dict(areas="areas.json", pairs="pairs.csv", frames="frames.csv", photos="photos", views="photos")
