@@ -48,7 +48,7 @@ class Reader:
 ROOT = Path(__file__).resolve().parents[2]
 BREACHES = ("other exception", "crash", "hang", "executed", "left a file", "memory", "slow", "no sentence")
 # A case has 5 s of processor time. The wall-clock limit is longer, because the machine may be busy.
-_PATIENCE = 60.0
+_PATIENCE = 120.0
 PYTHON_WORDS = re.compile(
     r"index out of|object has no|not subscriptable|not iterable|not callable|NoneType|Error\b|could not convert s|"
     r"invalid literal|unpack|inhomogeneous|unhashable|must be real number|unsupported operand|not supported between"
@@ -97,15 +97,16 @@ class Child:
             stderr=self._errors,
             env={**os.environ, "OMP_NUM_THREADS": "1"},
         )
-        first = self._line()
+        # The child compiles the kernels of all commands first.
+        first = self._line(waits=20)
         if not first or not json.loads(first).get("ready"):
             self.close()
             raise RuntimeError(f"the child did not start: {self.last_words()}")
 
-    def _line(self) -> bytes | None:
+    def _line(self, waits: int = 2) -> bytes | None:
         """Return the next line; None if none arrives in time, "" if the process has ended."""
         # Waits twice: if the machine was suspended, the first wait ends before the child has had its time.
-        for _ in range(2):
+        for _ in range(waits):
             if select.select([self._process.stdout], [], [], _PATIENCE)[0]:
                 return self._process.stdout.readline()
         return None
