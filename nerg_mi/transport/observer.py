@@ -271,7 +271,9 @@ def camera_windows(sensor: mi.Sensor) -> tuple[Window, ...] | None:
         # One more cell on both sides: a film can sample its border.
         count = -(-int(size) // CELL_PIXELS)
         edge = (last - first) / size * CELL_PIXELS
-        lower.append(first - edge), upper.append(first + (count + 1) * edge), cells.append(count + 2)
+        lower.append(float(first - edge))
+        upper.append(float(first + (count + 1) * edge))
+        cells.append(count + 2)
     return (Window(axes, tuple(lower), tuple(upper), tuple(cells)),)
 
 
