@@ -21,7 +21,7 @@ from nerg_mi.maths.types import Bool, Float, UInt32, Vector3f
 from .jit import Fingerprint
 from .march_primal import MarchRequest, MarchResult, optical_depth_limits
 from .medium import ColorShader, LocalRay
-from .splat_medium import MAX_ALPHA, SHAPE_SIZE, SplatArrays, SplatHits, SplatMedium
+from .splat_medium import SHAPE_SIZE, SplatArrays, SplatHits, SplatMedium, find_peak
 
 MIN_ALPHA = 1 / 255
 """Absorbed fraction below which a Gaussian is left out, as in 3DGS."""
@@ -179,13 +179,7 @@ class SplatLists(SplatHits):
             """``(t, alpha, hit)`` of the Gaussian ``rank``; t from the viewpoint."""
             at = lambda i: dr.gather(Float, self._rows, rank * ROW_SIZE + i, active)
             along = [dr.fma(at(i), ray.d.x, dr.fma(at(i + 1), ray.d.y, at(i + 2) * ray.d.z)) for i in (0, 3, 6)]
-            origin = [at(9), at(10), at(11)]
-            dot = lambda a, b: dr.fma(a[0], b[0], dr.fma(a[1], b[1], a[2] * b[2]))
-            square = dot(along, along)
-            t = -dot(origin, along) / dr.select(square > 0, square, 1)
-            off = [dr.fma(t, v, p) for v, p in zip(along, origin)]
-            distance = dot(off, off)
-            alpha = dr.minimum(at(12) * dr.exp(-0.5 * distance), MAX_ALPHA)
+            t, alpha, distance = find_peak([at(9), at(10), at(11)], along, at(12))
             return t, alpha, active & (t >= t0) & (t < t1) & (alpha >= MIN_ALPHA) & (distance < self.arrays.extent**2)
 
         def blend(ray_state: _Blend, nearest: _Hit, active: Bool) -> tuple[_Blend, Bool]:

@@ -185,11 +185,7 @@ class SplatArrays:
         x, y, z = o.x - g[9], o.y - g[10], o.z - g[11]
         from_center = [dr.fma(g[i], x, dr.fma(g[i + 1], y, g[i + 2] * z)) for i in (0, 3, 6)]
         along = [dr.fma(g[i], d.x, dr.fma(g[i + 1], d.y, g[i + 2] * d.z)) for i in (0, 3, 6)]
-        square = _dot(along, along)
-        t = -_dot(from_center, along) / dr.select(square > 0, square, 1)
-        off = [dr.fma(t, v, p) for v, p in zip(along, from_center)]
-        distance = _dot(off, off)
-        return t, dr.minimum(g[12] * dr.exp(-0.5 * distance), MAX_ALPHA), distance
+        return find_peak(from_center, along, g[12])
 
     def color(self, index: UInt32, w: Vector3f, active: Bool) -> Color:
         """Colour of the Gaussian ``index`` (in tree order) for the unit ray direction ``w``: a list of three."""
@@ -199,6 +195,16 @@ class SplatArrays:
         for k, value in enumerate(values):
             sums = [dr.fma(value, c[3 * k + i], total) for i, total in enumerate(sums)]
         return [dr.maximum(total, 0) for total in sums]
+
+
+def find_peak(from_center: list[Float], along: list[Float], opacity: Float) -> tuple[Float, Float, Float]:
+    """`SplatArrays.find_peak` on a ray in the axes of a Gaussian, in standard deviations: ``from_center`` to the origin
+    of the ray, and its displacement ``along`` per unit of t."""
+    square = _dot(along, along)
+    t = -_dot(from_center, along) / dr.select(square > 0, square, 1)
+    off = [dr.fma(t, v, p) for v, p in zip(along, from_center)]
+    distance = _dot(off, off)
+    return t, dr.minimum(opacity * dr.exp(-0.5 * distance), MAX_ALPHA), distance
 
 
 def _dot(a: list[Float], b: list[Float]) -> Float:
