@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy
 import pytest
+from packaging.requirements import Requirement
 
 from nerg_mi import diagnosis, llvm
 from nerg_mi.errors import NergError, UnusableLLVM, translate_mitsuba_errors
@@ -488,6 +489,27 @@ def test26_old_driver_is_reported(monkeypatch, version, old):
     monkeypatch.setattr(diagnosis, "try_backend", lambda backend: {**WORKS, "version": version})
     monkeypatch.setattr(llvm, "has_cuda", lambda: True)
     assert ("R570" in str(diagnosis.run_diagnosis())) is old
+
+
+HOLES = [
+    # Dependency, last affected version of each release line, advisory, oldest Python with a corrected version.
+    ("pillow", ["12.2.0"], "CVE-2026-54058", "3.10"),
+    ("pillow", ["12.3.0"], "CVE-2026-112403", "3.11"),
+    ("OpenEXR", ["3.4.16", "3.5.2"], "GHSA-frx8-5p4h-j8m7", "3.10"),
+    ("torch", ["2.10.0"], "PYSEC-2026-139", "3.10"),
+    ("pyarrow", ["23.0.0"], "CVE-2026-25087", "3.10"),
+    ("av", ["17.0.1"], "CVE-2026-8461", "3.10"),
+    ("distributed", ["2025.12.0"], "CVE-2026-23528", "3.10"),
+    ("setuptools", ["78.1.0"], "CVE-2025-47273", "3.10"),
+]
+
+
+@pytest.mark.parametrize("name, affected, advisory, python", HOLES)
+def test_versions_with_known_holes_are_not_admitted(name, affected, advisory, python):
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    requirements = [Requirement(match) for match in re.findall(rf'"({name}\b[^"\n]*[<>=][^"\n]*)"', text)]
+    valid = [r for r in requirements if r.marker is None or r.marker.evaluate({"python_version": python})]
+    assert valid and not any(r.specifier.contains(version) for r in valid for version in affected), advisory
 
 
 def test_all_packages_are_installed():

@@ -199,6 +199,17 @@ def test_unknown_codecs_are_refused(film, tmp_path, av):
         list(select_sharpest_frames(tmp_path / "a.mp4", 3))
 
 
+def test_decoders_that_cameras_do_not_need_do_not_run(av, tmp_path):
+    # Among these are most of those with holes.
+    with av.open(tmp_path / "a.avi", "w") as out:
+        stream = out.add_stream("huffyuv", rate=25, width=64, height=64, pix_fmt="yuv422p")
+        for packet in [*stream.encode(av.VideoFrame(64, 64, "yuv422p")), *stream.encode()]:
+            out.mux(packet)
+    with pytest.raises(NergError, match="convert it to H.264"):
+        list(select_sharpest_frames(tmp_path / "a.avi", 1))
+    assert not {"vvc", "magicyuv", "tdsc", "apac"} & set(module.CODECS)
+
+
 def test_tables_with_excessive_claims_are_refused(film, tmp_path):
     raw = bytearray(film.read_bytes())
     at = raw.index(b"stsz") + 8
