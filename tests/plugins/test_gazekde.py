@@ -1,5 +1,6 @@
 """The density of tracked rays in the integrator: against the float64 sum over the rays."""
 
+import drjit as dr
 import numpy as np
 import pytest
 
@@ -7,7 +8,21 @@ from nerg_mi.maths.vmf import log_normaliser
 from nerg_mi.tracking.rays import Rays
 from tests.reference import kde as reference
 
-from .scenes import camera, channels, make_observer, named, picture, plugin, points, put, room, scene_with, stored, wall
+from .scenes import (
+    attach,
+    camera,
+    channels,
+    make_observer,
+    named,
+    picture,
+    plugin,
+    points,
+    put,
+    room,
+    scene_with,
+    stored,
+    wall,
+)
 
 KAPPA = 20.0
 # Error of the table: 1e-4 of the maximum density of one ray.
@@ -31,8 +46,9 @@ def rays(tmp_path_factory):
     return str(path)
 
 
-def shown(rays, aovs="kde,position", count=4096, **overrides):
-    return plugin("nerg", aovs=aovs, radiance=False, kde=stored("gazekde", rays, count=count, kappa=KAPPA), **overrides)
+def shown(rays, aovs="kde,position", count=4096, radiance=False, **overrides):
+    kde = stored("gazekde", rays, count=count, kappa=KAPPA)
+    return plugin("nerg", aovs=aovs, radiance=radiance, kde=kde, **overrides)
 
 
 def expected(eye, out, count=4096):
@@ -138,3 +154,18 @@ def test09_density_is_zero_without_a_surface(rgb, rays):
     assert solid.sum() > 5 and (out["opacity.Y"][~solid] > 0).any() and (out["opacity.Y"] == 0).any()
     assert not out["kde.Y"][~solid].any()
     np.testing.assert_allclose(out["kde.Y"][solid], expected(eye, out)[solid], rtol=1e-3, atol=1e-5)
+
+
+def test_rays_beside_a_differentiated_albedo_are_one_kernel(rgb, rays):
+    """Mitsuba evaluates the loops of a derivative: each ray would be a kernel."""
+    counts = []
+    for count in (20, 200):
+        integrator = shown(rays, "kde", count, radiance=True)
+        scene = scene_with(rgb, integrator, camera(rgb, (0.1, -0.2, 0.3), (0.5, 0.4, 0), size=8), **room(rgb))
+        params = rgb.traverse(scene)
+        attach(params, next(k for k in params.keys() if k.endswith("reflectance.value")))
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            dr.backward(dr.mean(rgb.render(scene, params, spp=4)[..., :3]))
+            counts.append(len(dr.kernel_history([dr.KernelType.JIT])))
+    assert counts[0] == counts[1] < 30
