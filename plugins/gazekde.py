@@ -67,15 +67,15 @@ from nerg_mi.tracking.rays import Rays
 class GazeKdeVolume(mi.Volume):
     __doc__ = __doc__
 
-    def __init__(self, props):
+    def __init__(self, props, rays=None):
         super().__init__(props)
-        self.filename = resolve_scene_file(read_string(props, "filename"))
+        self.filename = resolve_scene_file(read_string(props, "filename")) if rays is None else "in memory"
         count, kappa = (
             read_integer(props, "count", 4096, Range(1, 1 << 24)),
             read_number(props, "kappa", 20.0, Range(0, 1e8)),
         )
         to_world = Similarity(read_transform(props, "to_world"))
-        rays = Rays.load(self.filename)
+        rays = Rays.load(self.filename) if rays is None else rays
         self.rays = len(rays)
         self._view = KdeView(rays, count, kappa, to_world, namespace(mi.Float))
         self._bounds = to_world.bounds(rays.origin.min(axis=0), rays.origin.max(axis=0))

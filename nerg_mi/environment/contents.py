@@ -28,6 +28,7 @@ from nerg_mi.formats.surfaces import write_volume
 from nerg_mi.maths.color import decode_srgb
 from nerg_mi.properties import resolve_scene_file
 from nerg_mi.registration import PLUGINS, get_plugin_class
+from nerg_mi.tracking.rays import Rays
 
 from .rendering_files import check_mesh, read_vol, write_mesh
 from .scene_writer import (
@@ -429,6 +430,25 @@ def _load_values(content: Mapping[str, Any]) -> dict[str, Any]:
         return _load_values(value) if isinstance(value, Mapping) else value
 
     return {name: load(name, value) for name, value in content.items()}
+
+
+def load_objects(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Load parts of a scene with Mitsuba, by name; numbers, texts and objects of Mitsuba are returned as they are."""
+    import mitsuba as mi
+
+    with translate_mitsuba_errors():
+        loaded = _load_values({"type": "scene", **content})
+        return {name: mi.load_dict(v) if isinstance(v := loaded[name], dict) else v for name in content}
+
+
+def make_kde_volume(rays: Rays, align: np.ndarray | None) -> Any:
+    """Return the volume of the density of ``rays``, which ``align`` (4, 4) transforms to the scene."""
+    import mitsuba as mi
+
+    props: Any = mi.Properties("gazekde")
+    if align is not None:
+        props["to_world"] = mi.ScalarTransform4d(align)
+    return get_plugin_class("gazekde")(props, rays)
 
 
 def has_nerg(content: Mapping[str, Any]) -> bool:

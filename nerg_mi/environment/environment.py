@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -16,8 +15,8 @@ from nerg_mi.errors import NergError, translate_mitsuba_errors
 from nerg_mi.fields.splats import Splats
 from nerg_mi.files import html
 from nerg_mi.files.atomic import file_sha256
-from nerg_mi.files.values import FilePath, normalize_name
-from nerg_mi.formats.meshes import read_mesh_file
+from nerg_mi.files.values import FilePath, hash_arrays, normalize_name
+from nerg_mi.formats.meshes import read_mesh_file, with_shading_normals
 from nerg_mi.formats.splats import read_splats, write_ply_splats
 from nerg_mi.formats.surfaces import write_volume
 from nerg_mi.maths.geometry import AnyBox, Box, Similarity
@@ -32,7 +31,9 @@ from nerg_mi.transport.volume_medium import VolumeMedium
 from .bands import is_nerg
 from .contents import (
     DensityGrid,
+    FieldVolume,
     GridVolume,
+    find_tag,
     from_trimesh,
     has_nerg,
     is_trimesh,
@@ -42,12 +43,12 @@ from .contents import (
 )
 from .hits import compute_hit_extent, make_volume_dict, voxelise_hits
 from .kinds import detect_kind
-from .nested_scene import nest_scene
+from .nested_scene import DEFAULT_SPP, VIEW_PROPERTIES, nest_scene
 from .radiance import RadianceField
 from .rendering_files import check_vol, write_mesh
-from .scene import Scene
+from .scene import Scene, find_content
 from .scene_loading import activate_mitsuba, get_array_module, load_scene
-from .scene_parts import show_directions, show_field, show_hits, show_mesh
+from .scene_parts import show_directions, show_field, show_hits, show_hits_in_memory, show_mesh, show_mesh_in_memory
 from .scene_writer import SceneContent
 from .trained import TrainedField
 
@@ -206,25 +207,23 @@ class Environment:
         """What is shown, in a sentence."""
         return _DESCRIPTIONS[self.kind].format("in memory" if self.path is None else self.path.name)
 
-    def to_scene_content(self, output: Path) -> SceneContent:
-        """Return what shows the environment, which has a file or no geometry, in the scene file ``output``.
+    def to_scene_content(self, output: Path | None = None) -> SceneContent:
+        """Return what shows the environment in the scene file ``output``, or in a scene in memory.
 
-        Files that Mitsuba needs are written next to it: colours of hit points, and a mesh that it cannot read. Raises
-        `NergError` for a file that cannot be shown.
+        In a scene file, the environment has a file or no geometry, and files that Mitsuba needs are written next to
+        it: colours of hit points, and a mesh that it cannot read. Raises `NergError` for a file that cannot be shown.
         """
         if self.kind == "none":
             return show_directions(DEFAULT_DEPTH)
-        assert self.path is not None, "environments in memory are saved first"
-        return _FILES[self.kind].show(self.path, output)
+        if self.path is not None:
+            return _FILES[self.kind].show(self.path, output)
+        assert output is None, "environments in memory are saved first"
+        return _show_source(self)
 
     @cached_property
     def digest(self) -> str:
         """SHA-256 (hex) of the surfaces: of the weights of a field, the Gaussians, the voxels, or the shapes."""
-        digest = hashlib.sha256()
-        for name, array in sorted(_list_arrays(self.medium).items()):
-            digest.update(f"{name} {array.shape} {array.dtype}".encode())
-            digest.update(np.ascontiguousarray(array).data)
-        return digest.hexdigest()
+        return hash_arrays(_list_arrays(self.medium))
 
     def _facts(self) -> list[tuple[str, str]]:
         name = self.path.name if self.path is not None else "in memory"
@@ -368,7 +367,7 @@ class _EnvironmentFile:
     """What files of one kind contain: how they are opened, and shown in the scene file ``output``."""
 
     open: Callable[[Path, bool], Environment]  # of a file, and whether shapes keep their names
-    show: Callable[[Path, Path], SceneContent]  # of a file and ``output``
+    show: Callable[[Path, Path | None], SceneContent]  # of a file and ``output``
     key: str  # of the file in the provenance
 
 
@@ -417,6 +416,35 @@ def _write_source(source: Any, stem: Path) -> Path:
     else:
         write_content(path := make_path(".xml"), _list_content(source), "Shapes of an environment.")
     return path
+
+
+def _show_source(environment: Environment) -> SceneContent:
+    """Return what shows an environment that has no file in a scene in memory."""
+    source, scene = environment.source, environment.scene_geometry.scene
+    if isinstance(source, (RadianceField, Splats)):
+        return SceneContent(volumes={"field": FieldVolume(source, "field")}, subject=environment.description)
+    if isinstance(source, DensityGrid):
+        return SceneContent(volumes=source.volumes(), subject=environment.description)
+    if isinstance(source, GridVolume):
+        return show_hits_in_memory(source.values, source.lower.astype(float), source.upper.astype(float))
+    if is_trimesh(source) and len(meshes := from_trimesh(source, "environment")) == 1:
+        return show_mesh_in_memory(with_shading_normals(next(iter(meshes.values()))))
+    if isinstance(source, Scene) and source.source is not None:
+        return nest_scene(*source.source)
+    # Children of the integrator are loaded objects; numbers and texts are known of a dict only.
+    content, nerg = find_content(source) or {}, environment.nerg
+    properties = next((child for child in content.values() if find_tag(child) == "integrator"), {})
+    values = {k: v for k, v in properties.items() if k != "type" and isinstance(v, (str, bool, int, float))}
+    if nerg is not None:
+        values |= nerg.children
+    is_lit = nerg is None or "integrator" in values or (scene is not None and bool(scene.emitters()))
+    return SceneContent(
+        volumes={name: value for name, value in values.items() if name not in VIEW_PROPERTIES},
+        shapes=to_scene_children(scene, "environment"),
+        spp=DEFAULT_SPP if is_lit else SceneContent.spp,
+        left_out=tuple(name for name in values if name in VIEW_PROPERTIES),
+        subject=environment.description,
+    )
 
 
 def _list_content(source: Any) -> dict[str, Any]:

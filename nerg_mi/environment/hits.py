@@ -325,8 +325,8 @@ def shade_hits(density: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tup
     return np.repeat(grey[..., None], 3, axis=-1).astype(np.float32), lower + cells[::-1] * _CELL * edge
 
 
-def shade_hit_volume(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the colours (z, y, x, 3) of the hit-point volume ``path``, and the lower and upper corner of their box.
+def read_hit_volume(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the density (z, y, x) of the hit-point volume ``path``, and the lower and upper corner of its box.
 
     Raises `NergError` for other files.
     """
@@ -339,5 +339,4 @@ def shade_hit_volume(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         raise NergError(
             f'"{path}" is not a volume of hit points; give one that "nerg train gaze --environment hits" has written'
         )
-    color, end = shade_hits(density.reshape(shape[2], shape[1], shape[0]), lower, upper)
-    return color, lower, end
+    return density.reshape(shape[2], shape[1], shape[0]), lower, upper

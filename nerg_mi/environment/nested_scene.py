@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from copy import deepcopy
 from pathlib import Path
 from xml.etree import ElementTree
@@ -38,17 +38,19 @@ DEFAULT_SPP = 64
 GAZE_PROPERTIES = ("gaze", "kde")
 """Names of the gaze in the integrator `nerg`."""
 
-# Properties of `nerg` that belong to a view of an environment; a written scene has its own.
-_VIEW_PROPERTIES = (*GAZE_PROPERTIES, "observer", *INTEGRATOR_SETTINGS)
+VIEW_PROPERTIES = (*GAZE_PROPERTIES, "observer", *INTEGRATOR_SETTINGS)
+"""Properties of `nerg` that belong to a view of an environment; a written scene has its own."""
 
 
-def nest_scene(path: Path) -> SceneContent:
+def nest_scene(path: Path, values: Mapping[str, str] | None = None) -> SceneContent:
     """Make the content of a new scene file from an existing one.
 
     Parameters
     ----------
     path : Path
         Scene file to nest.
+    values : mapping of str to str, optional
+        Values of its `<default>`s.
 
     Returns
     -------
@@ -60,7 +62,7 @@ def nest_scene(path: Path) -> SceneContent:
     NergError
         The file is not a scene file, has several integrators, or its integrator `nerg` is within another one.
     """
-    version, children = read_scene_elements(path)
+    version, children = read_scene_elements(path, values)
     defaults = [child for child in children if child.tag == "default"]
     values = resolve_defaults(children)
     others = [child for child in children if child.tag not in ("default", "integrator", "path")]
@@ -69,8 +71,8 @@ def nest_scene(path: Path) -> SceneContent:
     comment, copied, left_out = f"The integrator of {path.name} computes the light on the shapes.", [], ()
     if integrator is not None and is_nerg:
         comment = f"Copied from the integrator of {path.name}."
-        copied = [node for node in integrator if node.get("name") not in _VIEW_PROPERTIES]
-        left_out = tuple(name for node in integrator if (name := node.get("name", "")) in _VIEW_PROPERTIES)
+        copied = [node for node in integrator if node.get("name") not in VIEW_PROPERTIES]
+        left_out = tuple(name for node in integrator if (name := node.get("name", "")) in VIEW_PROPERTIES)
     elif integrator is not None:
         copied = [integrator]
     nodes = [node for child in (*copied, *others) for node in child.iter()]
@@ -91,8 +93,8 @@ def nest_scene(path: Path) -> SceneContent:
     )
 
 
-def read_scene_elements(path: Path) -> tuple[str, list[ElementTree.Element]]:
-    """Read the version and the elements of a scene file, with its includes expanded.
+def read_scene_elements(path: Path, values: Mapping[str, str] | None = None) -> tuple[str, list[ElementTree.Element]]:
+    """Read the version and the elements of a scene file, with its includes expanded and ``values`` of its `<default>`s.
 
     Raises
     ------
@@ -101,7 +103,11 @@ def read_scene_elements(path: Path) -> tuple[str, list[ElementTree.Element]]:
     """
     check_scene_file(path)
     root = _parse_root(path)
-    return root.get("version", "3.0.0"), list(_expand_includes(root, path, [path.parent]))
+    children = list(_expand_includes(root, path, [path.parent]))
+    for child in children:
+        if child.tag == "default" and (name := child.get("name", "")) in (values or {}):
+            child.set("value", check_attribute((values or {})[name]))
+    return root.get("version", "3.0.0"), children
 
 
 def resolve_defaults(children: list[ElementTree.Element]) -> dict[str, str]:

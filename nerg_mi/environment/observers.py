@@ -54,10 +54,10 @@ class ObserverChoice:
     """Where the observer of a written scene is, as in `nerg_mi.environment.scene_file.write_scene`."""
 
     point: Sequence[float] | None
-    person: str | None
-    time: float | None
-    time_range: Sequence[float] | None
-    fps: float
+    person: str | None = None
+    time: float | None = None
+    time_range: Sequence[float] | None = None
+    fps: float = 10.0
 
     def __post_init__(self) -> None:
         check_point(self.point, parameter("observer"))

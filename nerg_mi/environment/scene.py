@@ -40,11 +40,11 @@ from .contents import (
     to_scene_children,
     write_content,
 )
-from .hits import NO_DATA_GREY, shade_hit_volume
+from .hits import NO_DATA_GREY, read_hit_volume, shade_hits
 from .kinds import detect_kind
 from .nested_scene import make_paths_absolute, read_scene_elements, to_verbatim
 from .scene_loading import activate_mitsuba, load_scene
-from .scene_writer import check_attribute, compute_clip_distances, format_document
+from .scene_writer import compute_clip_distances, format_document
 from .trained import TrainedField
 
 COLOR = "color"
@@ -222,10 +222,7 @@ class Scene:
         check_writable(path, ".xml")
         if self.source is not None:
             source, values = self.source
-            version, children = read_scene_elements(source)
-            for child in children:
-                if child.tag == "default" and (name := child.get("name", "")) in values:
-                    child.set("value", check_attribute(values[name]))
+            version, children = read_scene_elements(source, values)
             elements = [child for child in children if child.tag != "path"]
             make_paths_absolute(elements, source, children)
             nodes = [to_verbatim(child) for child in elements]
@@ -480,7 +477,7 @@ def make_scene(
     integrator: dict[str, Any] = {"type": "nerg", **settings}
     transform = None if to_world is None else _as_transform(to_world)
     children: dict[str, Any] = {}
-    content = _find_content(environment)
+    content = find_content(environment)
     if content is not None:
         children = {k: v for k, v in content.items() if k != "type" and (camera is None or find_tag(v) != "sensor")}
         name = next(name for name, child in children.items() if find_tag(child) == "integrator")
@@ -583,7 +580,7 @@ def resolve_quantities(scene: Scene, names: object, allowed: tuple[str, ...] | N
     return tuple(dict.fromkeys(requested))
 
 
-def _find_content(environment: AnyEnvironment) -> dict[str, Any] | None:
+def find_content(environment: AnyEnvironment) -> dict[str, Any] | None:
     """The content of a scene with the integrator ``nerg`` that was made in Python; None for other environments."""
     if isinstance(environment, Scene):
         return environment._content
@@ -639,7 +636,8 @@ def _resolve_field(value: str | os.PathLike, name: str, kind: str) -> Path:
 
 def _make_hit_volumes(path: Path, to_world: Any) -> dict[str, Any]:
     """Make the density and the colour of a volume of hit points, as properties of the integrator."""
-    color, lower, upper = shade_hit_volume(path)
+    density, lower, upper = read_hit_volume(path)
+    color, upper = shade_hits(density, lower, upper)
     world = {} if to_world is None else {"to_world": to_world}
     return {
         "density": {"type": "gridvolume", "filename": os.path.abspath(path), "use_grid_bbox": True, **world},

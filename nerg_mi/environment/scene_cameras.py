@@ -200,12 +200,12 @@ class CameraChoice:
     """What the camera of a written scene is, as in `nerg_mi.environment.scene_file.write_scene`."""
 
     point: Sequence[float] | None
-    target: Sequence[float] | None
-    first_person: bool
-    photos: FilePath | None
-    photo: str | None
-    allow_outside: bool
-    fov: float | None
+    target: Sequence[float] | None = None
+    first_person: bool = False
+    photos: FilePath | None = None
+    photo: str | None = None
+    allow_outside: bool = False
+    fov: float | None = None
 
     def __post_init__(self) -> None:
         check_point(self.point, parameter("camera"))

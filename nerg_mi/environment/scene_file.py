@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,12 +16,13 @@ from nerg_mi.files.html import Summary
 from nerg_mi.files.values import FilePath, to_path
 from nerg_mi.formats.alignments import AnySimilarity, open_similarity
 from nerg_mi.maths.geometry import Similarity
-from nerg_mi.progress import Progress, Reporter, open_reporter
+from nerg_mi.progress import SILENT, Progress, Reporter, open_reporter
 from nerg_mi.ranges import COORDINATES, FIELDS_OF_VIEW, RATES, TIMES, Range, check_ranges
 from nerg_mi.tracking.dataset import Conditions, RayDataset, open_rays, open_recordings
 from nerg_mi.tracking.rays import Rays
 
 from .arrays import check_point
+from .contents import FieldVolume, load_objects, make_kde_volume
 from .environment import Environment, make_hit_geometry, no_geometry
 from .gaze import GazeField, read_training_alignment
 from .inputs import sort_inputs
@@ -33,16 +33,15 @@ from .scene import AnyEnvironment, Scene
 from .scene_cameras import (
     PROBE_SIZE,
     CameraChoice,
-    PlacedCamera,
     SceneProbe,
     make_upright,
     probe_values,
     sees_anything,
     turn_to_attention,
 )
-from .scene_loading import activate_mitsuba, load_scene
+from .scene_loading import activate_mitsuba, load_scene_text
 from .scene_parts import colors_path
-from .scene_writer import GazeFiles, Lens, LookAt, SceneContent, SceneText, format_numbers, free_default_name
+from .scene_writer import GazeFiles, LookAt, SceneContent, SceneText, format_numbers, free_default_name
 from .sensors import describe_observer
 
 MAX_SCENE_RAYS = 1_000_000
@@ -198,64 +197,48 @@ def write_scene(
     activate_mitsuba()
     with open_reporter(progress) as reporter:
         reporter.progress(0.0, "reading the files")
-        shown = _open_inputs(inputs, environment, output, reporter, () if time_range is None else (frames_file,))
-        if align is not None:
-            shown = replace(shown, align=open_similarity(align, "rays to place", reporter.warn))
-        content = _show_environment(shown, output, reporter)
-        reporter.progress(0.1, "placing the observer")
-        placed = observers.place(
-            shown.select_person(person), shown.gaze, shown.align, shown.environment.has_surfaces, reporter
-        )
-        upward = _find_up(shown, up)
-        eye = None if placed.eye is None else make_upright(placed.eye, upward)
-        draft = _Draft(content, shown.files, shown.align, upward, eye)
-        is_turned = placed.walk is None and person is None
-        draft, chosen = _place_camera(draft, is_turned, shown.environment, cameras, reporter)
-        text = draft.text(chosen.eye, chosen.lens, width)
-        comment = _describe_scene(output, text)
-        text = replace(text, comment=comment, camera_comment=chosen.note, observer_comment=placed.note)
-        write_text(output, text.to_xml(output.parent))
-        written = [output, *shown.written, *content.written]
-        if placed.walk is not None:
-            write_frames(frames_file, _make_frames(placed.walk, first_person, content.reserved_names))
-            written.append(frames_file)
-            missing = placed.walk.missing
-            pauses = f"; {missing} more are in pauses of the rays" if missing else ""
-            count = len(placed.walk.eyes)
+        shown = open_shown(inputs, environment, align, reporter)
+        for path in (*_plan_files(shown, output), *(() if time_range is None else (frames_file,))):
+            check_writable(path)
+        placed = place_scene(shown, observers, cameras, width, up, reporter)
+        written = placed.save(output, reporter)
+        if (walk := placed.walk) is not None:
+            write_frames(frames_file, _make_frames(walk, first_person, written.reserved_names))
+            written = replace(written, files=(*written.files, frames_file), num_frames=len(walk.eyes))
+            pauses = f"; {walk.missing} more are in pauses of the rays" if walk.missing else ""
+            count = len(walk.eyes)
             reporter.message(f"{count} frames{pauses}: nerg render {output} -o walk.png --frames {frames_file}")
-        for sentence in (placed.note, chosen.note, *(f"wrote {path}" for path in written)):
+        text = placed.text
+        for sentence in (text.observer_comment, text.camera_comment, *(f"wrote {path}" for path in written.files)):
             if sentence:
                 reporter.message(sentence)
-    return WrittenScene(
-        output,
-        tuple(written),
-        shown.environment,
-        shown.gaze,
-        chosen.eye,
-        draft.observer,
-        shown.files.quantity,
-        0 if placed.walk is None else len(placed.walk.eyes),
-        content.reserved_names,
-    )
+    return written
 
 
 # ---- What a scene shows ----
 
 
 @dataclass(frozen=True, eq=False)
-class _Shown:
-    """What a scene shows: objects, their ``files``, and those of them that were ``written`` for the scene.
+class ShownObjects:
+    """What a scene shows, in memory or in files.
 
-    ``rays`` are a sample of ``recordings``, and ``align`` transforms from them to the scene.
+    ``rays`` are a sample of ``recordings``, with a ``rays_file`` if that has all of them, and ``align`` transforms from
+    them to the scene.
     """
 
     environment: Environment
     gaze: GazeField | None
     recordings: Rays | RayDataset | None
     rays: Rays | None
-    files: GazeFiles
+    rays_file: Path | None
     align: Similarity
-    written: tuple[Path, ...]
+
+    @property
+    def gaze_files(self) -> GazeFiles:
+        """The gaze, as files where there are any."""
+        gaze = self.gaze if self.gaze is None else self.gaze.path or self.gaze
+        align = None if self.align.is_identity else self.align.matrix
+        return GazeFiles(gaze, self.rays if self.rays_file is None else self.rays_file, align)
 
     def select_person(self, person: str | None) -> Rays | None:
         """Return rays in which to look up a ``person``: of a dataset all of theirs, not only the sample."""
@@ -263,14 +246,35 @@ class _Shown:
             return self.recordings.load(Conditions(persons=[person]))
         return self.rays
 
+    def save_beside(self, output: Path, reporter: Reporter) -> tuple[ShownObjects, list[Path]]:
+        """Write what has no file next to the scene ``output``. Return these objects with their files, and the new ones.
 
-def _open_inputs(
-    inputs: object, environment: AnyEnvironment, output: Path, reporter: Reporter, planned: tuple[Path, ...]
-) -> _Shown:
-    """Open what the scene shows, and write what has no file next to ``output``.
+        Raises `NergError` if one cannot be written.
+        """
+        rays_file, written, gaze = self.rays_file, list[Path](), self.gaze
+        if self.rays is not None and rays_file is None:
+            self.rays.save(rays_file := output.with_suffix(".rays.npz"))
+            written.append(rays_file)
+            if isinstance(self.recordings, RayDataset):
+                reporter.message(f"the scene shows {len(self.rays):,} rays of the dataset, stored next to it")
+        saved = self.environment.save_beside(output)
+        if saved is not self.environment and saved.path is not None:
+            written.append(saved.path)
+        if gaze is not None and gaze.path is None:
+            # Its environment is that of the scene, unless it was trained in another one.
+            recorded = replace(gaze, environment=saved) if gaze.is_trained_in(saved) else gaze
+            written.append(recorded.save(output.with_suffix(".gaze.safetensors")))
+            gaze = replace(gaze, path=written[-1])
+        return replace(self, environment=saved, gaze=gaze, rays_file=rays_file), written
 
-    Raises `NergError` before anything is written if one of the outputs, or of those ``planned`` after them, cannot be.
-    """
+
+def open_shown(
+    inputs: object,
+    environment: AnyEnvironment = None,
+    align: AnySimilarity | FilePath | None = None,
+    reporter: Reporter = SILENT,
+) -> ShownObjects:
+    """Open what a scene shows. Parameters and errors as for `write_scene`."""
     sources = sort_inputs(inputs)
     if environment is not None and sources.environment is not None:
         raise NergError(f"there is already an environment among the files; leave out {parameter('environment')}")
@@ -279,31 +283,19 @@ def _open_inputs(
         raise NergError("a scene needs a field, a mesh, a scene file, a gaze field or rays; name at least one")
     recordings = None if sources.rays is None else open_recordings(sources.rays)
     rays = None if recordings is None else open_rays(recordings, MAX_SCENE_RAYS)
+    rays_file = Path(sources.rays) if isinstance(sources.rays, (str, os.PathLike)) else None
+    if isinstance(recordings, RayDataset):
+        rays_file = None  # The scene shows a sample.
     gaze = None if sources.gaze is None else GazeField.open(sources.gaze)
     opened = _open_environment(sources.environment, gaze, rays, reporter)
-    written, rays_file = list[Path](), None
-    if isinstance(recordings, Rays) and isinstance(sources.rays, (str, os.PathLike)):
-        rays_file = Path(sources.rays)
-    elif rays is not None:
-        written.append(rays_file := output.with_suffix(".rays.npz"))
-    if opened.kind == "hits":
-        planned = (*planned, output.with_suffix(".vol"), colors_path(output))
-    for path in (*written, *planned):
-        check_writable(path)
-    if rays is not None and written:
-        rays.save(written[0])
-        if isinstance(recordings, RayDataset):
-            reporter.message(f"the scene shows {len(rays):,} rays of the dataset, stored next to it")
-    saved = opened.save_beside(output)
-    if saved is not opened and saved.path is not None:
-        written.append(saved.path)
-    if gaze is not None and gaze.path is None:
-        # Its environment is that of the scene, unless it was trained in another one.
-        recorded = replace(gaze, environment=saved) if gaze.is_trained_in(saved) else gaze
-        written.append(recorded.save(output.with_suffix(".gaze.safetensors")))
-        gaze = replace(gaze, path=written[-1])
-    files = GazeFiles(None if gaze is None else gaze.path, rays_file)
-    return _Shown(saved, gaze, recordings, rays, files, saved.align, tuple(written))
+    placed = opened.align if align is None else open_similarity(align, "rays to place", reporter.warn)
+    return ShownObjects(opened, gaze, recordings, rays, rays_file, placed)
+
+
+def _plan_files(shown: ShownObjects, output: Path) -> list[Path]:
+    """Return the files next to ``output`` that can be named in advance."""
+    rays = [output.with_suffix(".rays.npz")] if shown.rays is not None and shown.rays_file is None else []
+    return [*rays, output.with_suffix(".vol"), colors_path(output)] if shown.environment.kind == "hits" else rays
 
 
 def _open_environment(
@@ -331,25 +323,26 @@ def _open_environment(
     return made
 
 
-def _show_environment(shown: _Shown, output: Path, reporter: Reporter) -> SceneContent:
-    """Return the content of the scene, and report what is not used of its file."""
-    content, path = shown.environment.to_scene_content(output), shown.environment.path
+def _show_environment(shown: ShownObjects, reporter: Reporter) -> SceneContent:
+    """Return the content of the scene in memory, and report what is not used of its file."""
+    content, path = shown.environment.to_scene_content(), shown.environment.path
+    name = "the environment" if path is None else path
     # Gaze is replaced, and never only lost.
     replaced_by = dict(zip(GAZE_PROPERTIES, (shown.gaze, shown.gaze or shown.rays)))
-    for name in content.left_out:
-        if name in replaced_by and replaced_by[name] is None:
+    for part in content.left_out:
+        if part in replaced_by and replaced_by[part] is None:
             raise NergError(
-                f'"{path}" already has the "{name}" of an observer; use it as it is, or also name the gaze field to '
+                f'"{name}" already has the "{part}" of an observer; use it as it is, or also name the gaze field to '
                 "show in its place"
             )
-    left_out = [name for name in content.left_out if name != "aovs"]
+    left_out = [part for part in content.left_out if part != "aovs"]
     unused = [f"not used of its integrator: {', '.join(left_out)}"] if left_out else []
     for note in (*shown.environment.notes, *unused):
-        reporter.message(f"{path}: {note}")
+        reporter.message(f"{name}: {note}")
     return content
 
 
-def _find_up(shown: _Shown, up: Sequence[float] | None) -> np.ndarray:
+def _find_up(shown: ShownObjects, up: Sequence[float] | None) -> np.ndarray:
     """Return the up direction: as given, that of the rays, that of the radiance field, or +z."""
     direction: Any = up
     is_tracked = shown.rays is not None or (shown.gaze is not None and "rays_file" in shown.gaze.provenance)
@@ -364,67 +357,105 @@ def _find_up(shown: _Shown, up: Sequence[float] | None) -> np.ndarray:
     return direction / length
 
 
-# ---- The camera of a scene, and its text ----
+# ---- A scene in memory, and its camera ----
 
 
 @dataclass(frozen=True, eq=False)
-class _Draft:
-    """A scene without its camera."""
+class PlacedScene:
+    """A scene in memory: what it shows, its ``text`` with camera and observer, and the ``walk`` of the observer."""
 
-    content: SceneContent
-    gaze_files: GazeFiles
-    align: Similarity
-    up: np.ndarray
-    observer: LookAt | None
-    extent: float = 10.0
+    shown: ShownObjects
+    text: SceneText
+    walk: ObserverPath | None = None
 
-    def text(self, camera: LookAt, lens: Lens, width: int) -> SceneText:
-        """Return the scene with a camera; its unit is that of the rays if there is gaze."""
-        unit = 1.0 if self.gaze_files.quantity is None else self.align.scale
-        gaze_files = replace(self.gaze_files, align=None if self.align.is_identity else self.align.matrix)
-        return SceneText(self.content, gaze_files, camera, self.observer, self.up, lens, width, unit, self.extent)
+    def load(self, **defaults: object) -> Any:
+        """Load the scene with Mitsuba, with values of its `<default>`s by their names in a scene of `write_scene`."""
+        content, gaze = self.text.content, self.text.gaze_files
+        values = {free_default_name(name, content.reserved_names): str(value) for name, value in defaults.items()}
+        volumes = dict(content.volumes)
+        if isinstance(gaze.gaze, GazeField):
+            volumes["gaze"] = FieldVolume(gaze.gaze, "gaze")
+        if isinstance(gaze.rays, Rays):
+            volumes["kde"] = make_kde_volume(gaze.rays, gaze.align)
+        return load_scene_text(self.text.to_xml(), values, load_objects(volumes), load_objects(content.shapes))
 
-    def load(self, file: Path, camera: LookAt, lens: Lens) -> Any:
-        """Write the scene to ``file``, and load it for probing."""
-        write_text(file, self.text(camera, lens, PROBE_SIZE[0]).to_xml(file.parent))
-        taken = self.content.reserved_names
-        return load_scene(file, {free_default_name(name, taken): value for name, value in probe_values().items()})
+    def save(self, output: Path, reporter: Reporter) -> WrittenScene:
+        """Write the scene file ``output``, and what has no file next to it. Raises `NergError`."""
+        shown, written = self.shown.save_beside(output, reporter)
+        content = shown.environment.to_scene_content(output)
+        text = replace(self.text, content=content, gaze_files=shown.gaze_files)
+        write_text(output, replace(text, comment=_describe_scene(output, text)).to_xml(output.parent))
+        return WrittenScene(
+            output,
+            (output, *written, *content.written),
+            shown.environment,
+            shown.gaze,
+            text.camera,
+            text.observer,
+            text.gaze_files.quantity,
+            0,
+            content.reserved_names,
+        )
 
 
-def _place_camera(
-    draft: _Draft, is_turned: bool, environment: Environment, cameras: CameraChoice, reporter: Reporter
-) -> tuple[_Draft, PlacedCamera]:
+def place_scene(
+    shown: ShownObjects,
+    observers: ObserverChoice,
+    cameras: CameraChoice,
+    width: int,
+    up: Sequence[float] | None = None,
+    reporter: Reporter = SILENT,
+) -> PlacedScene:
+    """Place the observer and the camera in a scene in memory; Mitsuba must be active.
+
+    Raises `NergError` if they cannot be placed, or the image would be empty.
+    """
+    content = _show_environment(shown, reporter)
+    reporter.progress(0.1, "placing the observer")
+    person, has_surfaces = observers.person, shown.environment.has_surfaces
+    placed = observers.place(shown.select_person(person), shown.gaze, shown.align, has_surfaces, reporter)
+    upward = _find_up(shown, up)
+    eye = None if placed.eye is None else make_upright(placed.eye, upward)
+    # With a preliminary camera; the unit is that of the rays if there is gaze.
+    first = eye or make_upright(LookAt(np.zeros(3), upward), upward)
+    unit = 1.0 if shown.gaze_files.quantity is None else shown.align.scale
+    text = SceneText(content, shown.gaze_files, first, eye, upward, unit=unit, observer_comment=placed.note)
+    draft = PlacedScene(shown, replace(text, width=PROBE_SIZE[0]), placed.walk)
+    draft = _place_camera(draft, placed.walk is None and person is None, cameras, reporter)
+    return replace(draft, text=replace(draft.text, width=width))
+
+
+def _place_camera(draft: PlacedScene, is_turned: bool, cameras: CameraChoice, reporter: Reporter) -> PlacedScene:
     """Return the scene with its extent, and its camera; the observer is turned to its attention if ``is_turned``."""
-    up = draft.up
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "scene.xml"
-        # With a preliminary camera.
-        loaded = draft.load(file, draft.observer or make_upright(LookAt(np.zeros(3), up), up), Lens())
-        probe = SceneProbe(loaded, draft.gaze_files.quantity, up)
-        reporter.progress(0.3, "probing the surroundings")
-        seen = None if draft.observer is None else probe.around(draft.observer)
-        if sentence := describe_observer(probe.scene):
-            reporter.warn(sentence)
-        elif seen is not None and not seen.is_hit.any() and environment.has_surfaces:
-            reporter.warn(f"the observer sees no surface; move it with {parameter('observer')}, or check the alignment")
-        if draft.observer is not None and seen is not None and is_turned:
-            draft = replace(draft, observer=make_upright(turn_to_attention(draft.observer, seen), up))
-        reporter.progress(0.5, "searching for the best camera")
-        placed = cameras.place(environment, draft.observer, probe, seen, reporter)
-        placed = replace(placed, eye=make_upright(placed.eye, up))
-        draft = replace(draft, extent=probe.extent(placed.eye, draft.observer))
-        if environment.kind == "scene" and draft.extent < SMALLEST:
-            reporter.warn(
-                f"the scene is {draft.extent:.3g} units large, and Mitsuba offsets rays from surfaces by at least "
-                "1e-4 units, so light leaks through walls; scale the scene to metres"
-            )
-        reporter.progress(0.8, "checking the image")
-        if not sees_anything(draft.load(file, placed.eye, placed.lens)):
-            raise NergError(
-                f"the image of the camera would be empty; choose another one with {parameter('camera')} and "
-                f"{parameter('target')}"
-            )
-    return draft, placed
+    environment, text = draft.shown.environment, draft.text
+    up, observer = text.up, text.observer
+    probe = SceneProbe(draft.load(**probe_values()), text.gaze_files.quantity, up)
+    reporter.progress(0.3, "probing the surroundings")
+    seen = None if observer is None else probe.around(observer)
+    if sentence := describe_observer(probe.scene):
+        reporter.warn(sentence)
+    elif seen is not None and not seen.is_hit.any() and environment.has_surfaces:
+        reporter.warn(f"the observer sees no surface; move it with {parameter('observer')}, or check the alignment")
+    if observer is not None and seen is not None and is_turned:
+        observer = make_upright(turn_to_attention(observer, seen), up)
+    reporter.progress(0.5, "searching for the best camera")
+    placed = cameras.place(environment, observer, probe, seen, reporter)
+    eye = make_upright(placed.eye, up)
+    extent = probe.extent(eye, observer)
+    if environment.kind == "scene" and extent < SMALLEST:
+        reporter.warn(
+            f"the scene is {extent:.3g} units large, and Mitsuba offsets rays from surfaces by at least 1e-4 units, so "
+            "light leaks through walls; scale the scene to metres"
+        )
+    reporter.progress(0.8, "checking the image")
+    text = replace(text, camera=eye, observer=observer, lens=placed.lens, extent=extent, camera_comment=placed.note)
+    draft = replace(draft, text=text)
+    if not sees_anything(draft.load(**probe_values())):
+        raise NergError(
+            f"the image of the camera would be empty; choose another one with {parameter('camera')} and "
+            f"{parameter('target')}"
+        )
+    return draft
 
 
 def _describe_scene(output: Path, text: SceneText) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import platform
 import re
@@ -77,6 +78,11 @@ def check_scene_file(path: str | Path, defaults: Mapping[str, str] | None = None
     _SceneFileChecker(path.parent, {k: str(v) for k, v in (defaults or {}).items()}).check(path)
 
 
+def _check_scene_text(text: str, defaults: Mapping[str, str]) -> None:
+    """Check a scene file in memory, as `check_scene_file`."""
+    _SceneFileChecker(Path(), dict(defaults)).check(Path("scene in memory"), text.encode())
+
+
 def list_scene_files(path: str | Path, defaults: Mapping[str, str] | None = None) -> list[Path]:
     """List a scene file and the existing files that it names: includes, meshes, fields and textures.
 
@@ -123,12 +129,12 @@ class _SceneFileChecker:
         self._meshes: dict[Path, str] = {}
         self._uses_mesh_colors = False
 
-    def check(self, path: Path) -> None:
-        self._read(path, 0, ())
+    def check(self, path: Path, data: bytes | None = None) -> None:
+        self._read(path, 0, (), data)
         for mesh, kind in self._meshes.items():
             check_mesh(mesh, kind, self._uses_mesh_colors)
 
-    def _read(self, path: Path, depth: int, parents: tuple[Path, ...]) -> None:
+    def _read(self, path: Path, depth: int, parents: tuple[Path, ...], data: bytes | None = None) -> None:
         resolved_path = resolve_path(path)
         if resolved_path in parents:
             raise NergError(f'the scene file "{path}" includes itself; remove that <include>')
@@ -158,7 +164,7 @@ class _SceneFileChecker:
         parser.StartElementHandler = start
         parser.EndElementHandler = lambda tag: stack.pop()
         try:
-            with open_file(path, "scene file") as file:
+            with open_file(path, "scene file") if data is None else io.BytesIO(data) as file:
                 while part := file.read(1 << 16):
                     self._count_bytes(len(part), path, parser)
                     parser.Parse(part, False)
@@ -393,4 +399,44 @@ def load_scene(path: str | Path, defaults: Mapping[str, str] | None = None, merg
             # Mitsuba quotes the unreadable data, which is not text.
             raise NergError(f'a mesh or another file of the scene "{path}" is damaged; create it again') from error
     check_scene(path, loaded)
+    return loaded
+
+
+def load_scene_text(text: str, defaults: Mapping[str, str], volumes: Mapping[str, Any], shapes: Mapping[str, Any]):
+    """Load the text of a scene file with absolute file names, and with objects in memory; the variant must be active.
+
+    Parameters
+    ----------
+    text : str
+        The text.
+    defaults : mapping of str to str
+        Values for its `<default>`s.
+    volumes, shapes : mapping of str to object
+        Further properties of its integrator and of the scene by name, such as objects of Mitsuba.
+
+    Returns
+    -------
+    mi.Scene
+        The scene.
+
+    Raises
+    ------
+    NergError
+        Mitsuba rejects the scene, or it fails the checks of this module.
+    """
+    import mitsuba as mi
+
+    _check_scene_text(text, defaults)
+    parser: Any = mi.parser
+    values: dict[str, Any] = dict(defaults)
+    with translate_mitsuba_errors(), ensure_two_threads():
+        config = parser.ParserConfig(mi.variant())
+        state = parser.parse_string(config, text, **values)
+        integrator = next(node for node in state.nodes if node.props.plugin_name() == "nerg")
+        for node, objects in ((integrator, volumes), (state.root, shapes)):
+            for name, value in objects.items():
+                node.props[name] = value
+        parser.transform_all(config, state)
+        loaded = parser.instantiate(config, state)
+    check_scene("scene in memory", loaded)
     return loaded

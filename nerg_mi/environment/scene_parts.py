@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from nerg_mi.errors import NergError
 from nerg_mi.files.safe_read import resolve_path
 from nerg_mi.formats.meshes import DEFAULT_GREY, MeshFile, read_mesh_file, with_shading_normals
@@ -11,12 +13,13 @@ from nerg_mi.formats.splats import choose_plugin
 from nerg_mi.formats.surfaces import write_volume
 from nerg_mi.transport.geometry import HEADLIGHT
 
-from .hits import NO_DATA_GREY, shade_hit_volume
+from .contents import GridVolume
+from .hits import NO_DATA_GREY, read_hit_volume, shade_hits
 from .rendering_files import write_mesh
 from .scene_writer import Comment, Node, SceneContent, element, prop
 
 
-def show_field(path: Path, output: Path) -> SceneContent:
+def show_field(path: Path, output: Path | None) -> SceneContent:
     """Return the content of a scene that shows a radiance field or Gaussian splats."""
     plugin = choose_plugin(path)
     volume = element("volume", prop("string", "filename", "$field"), name="field", type=plugin)
@@ -24,8 +27,8 @@ def show_field(path: Path, output: Path) -> SceneContent:
     return SceneContent(integrator_children=(volume,), files={"field": path}, subject=f"The {kind} {path.name}")
 
 
-def show_mesh(path: Path, output: Path) -> SceneContent:
-    """Return the content of the scene file ``output`` that shows a mesh.
+def show_mesh(path: Path, output: Path | None) -> SceneContent:
+    """Return the content of the scene file ``output``, or of a scene in memory, that shows a mesh.
 
     A mesh that Mitsuba cannot show as it is, is converted to a file next to ``output``. Raises `NergError` if that is
     the mesh itself.
@@ -33,6 +36,8 @@ def show_mesh(path: Path, output: Path) -> SceneContent:
     mesh = read_mesh_file(path)
     shaded, shown, written = with_shading_normals(mesh), path, ()
     if not mesh.is_readable_by_mitsuba or shaded is not mesh:
+        if output is None:
+            return show_mesh_in_memory(shaded)
         shown = output.with_name(f"{output.stem}.mesh.ply")
         if resolve_path(shown) == resolve_path(path):
             raise NergError(f'"{path}" would be overwritten by a converted mesh; give the scene another name')
@@ -42,15 +47,20 @@ def show_mesh(path: Path, output: Path) -> SceneContent:
     bsdf = element("bsdf", element("bsdf", _mesh_color(mesh), type="diffuse"), type="twosided")
     shape = element("shape", prop("string", "filename", "$place"), bsdf, type=kind, id="place")
     return SceneContent(
-        integrator_children=(
-            Comment("Without emitters, a headlight shows the mesh."),
-            prop("float", "headlight", HEADLIGHT),
-        ),
+        integrator_children=_HEADLIGHT,
         scene_children=(shape,),
         files={"place": shown},
         subject=f"The mesh {path.name}",
         written=written,
     )
+
+
+_HEADLIGHT = (Comment("Without emitters, a headlight shows the mesh."), prop("float", "headlight", HEADLIGHT))
+
+
+def show_mesh_in_memory(mesh: MeshFile) -> SceneContent:
+    """Return the content of a scene in memory that shows a mesh."""
+    return SceneContent(integrator_children=_HEADLIGHT, shapes={"place": mesh}, subject="A mesh")
 
 
 def _mesh_color(mesh: MeshFile) -> Node:
@@ -66,12 +76,15 @@ def colors_path(output: Path) -> Path:
     return output.with_name(f"{output.stem}.color.vol")
 
 
-def show_hits(path: Path, output: Path) -> SceneContent:
+def show_hits(path: Path, output: Path | None) -> SceneContent:
     """Return the content of the scene file ``output`` that shows a volume of hit points, whose colours are written next
-    to it."""
-    color, lower, upper = shade_hit_volume(path)
+    to it, or of a scene in memory."""
+    density, lower, upper = read_hit_volume(path)
+    if output is None:
+        return show_hits_in_memory(density, lower, upper)
     colors = colors_path(output)
-    write_volume(colors, color, lower, upper)
+    color, end = shade_hits(density, lower, upper)
+    write_volume(colors, color, lower, end)
     # Interpolation rounds the edges of voxels; it moves surfaces by less than half a voxel from where a training looked
     # for them (`nerg_mi.environment.hits.make_volume_dict`).
     box, raw = prop("boolean", "use_grid_bbox", "true"), prop("boolean", "raw", "true")
@@ -85,6 +98,16 @@ def show_hits(path: Path, output: Path) -> SceneContent:
         files={"density": path, "color": colors},
         subject=f"The hit points of rays in {path.name}, in grey shaded by surface orientation",
         written=(colors,),
+    )
+
+
+def show_hits_in_memory(density: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> SceneContent:
+    """Return the content of a scene in memory that shows a volume of hit points."""
+    color, end = shade_hits(density, lower, upper)
+    return SceneContent(
+        integrator_children=(prop("rgb", "background", NO_DATA_GREY),),
+        volumes={"density": GridVolume(density, lower, upper), "color": GridVolume(color, lower, end)},
+        subject="The hit points of rays, in grey shaded by surface orientation",
     )
 
 

@@ -295,6 +295,9 @@ class SceneContent:
         Name of the environment, which begins the first comment.
     written : tuple of Path
         Files that were written for it.
+    volumes, shapes : mapping of str to object
+        What has no file, by name: children of the integrator and of the scene, as dicts for ``mi.load_dict``, objects
+        of Mitsuba, or elements of `nerg_mi.environment.contents`. Only a scene in memory shows them.
     """
 
     integrator_children: tuple[Node, ...] = ()
@@ -308,6 +311,8 @@ class SceneContent:
     left_out: tuple[str, ...] = ()
     subject: str = ""
     written: tuple[Path, ...] = ()
+    volumes: Mapping[str, Any] = field(default_factory=dict)
+    shapes: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -316,16 +321,16 @@ class GazeFiles:
 
     Parameters
     ----------
-    gaze : Path or None
-        File of a gaze field.
-    rays : Path or None
-        File of recorded gaze samples, displayed as a kernel density.
+    gaze : Path, GazeField or None
+        A gaze field, as a file or in memory.
+    rays : Path, Rays or None
+        Recorded gaze samples, displayed as a kernel density.
     align : ndarray of shape (4, 4) or None
         Transform from the frame of the recordings to the scene. None: identity.
     """
 
-    gaze: Path | None = None
-    rays: Path | None = None
+    gaze: Any = None
+    rays: Any = None
     align: np.ndarray | None = None
 
     @property
@@ -381,8 +386,8 @@ class SceneText:
         the scene."""
         return float(np.clip(0.05 * self.unit, 1e-4 * self.extent, 0.02 * self.extent))
 
-    def to_xml(self, folder: Path) -> str:
-        """Return the text of a file in ``folder``, with file names relative to it.
+    def to_xml(self, folder: Path | None = None) -> str:
+        """Return the text of a file in ``folder``, with file names relative to it; of none, with absolute file names.
 
         Raises `NergError` for names that cannot be written.
         """
@@ -409,7 +414,7 @@ class _SceneNames:
         return f"${self(name)}"
 
 
-def _make_nodes(scene: SceneText, folder: Path) -> Sequence[Node]:
+def _make_nodes(scene: SceneText, folder: Path | None) -> Sequence[Node]:
     names, content = _SceneNames(scene.content.reserved_names), scene.content
     paths = dict.fromkeys(relative_path(path, folder) for path in content.folders)
     return [
@@ -426,14 +431,14 @@ def _make_nodes(scene: SceneText, folder: Path) -> Sequence[Node]:
     ]
 
 
-def _make_defaults(scene: SceneText, names: _SceneNames, folder: Path) -> list[Node]:
+def _make_defaults(scene: SceneText, names: _SceneNames, folder: Path | None) -> list[Node]:
     height = max(1, round(scene.width / scene.lens.aspect))
     gaze_files, sphere = scene.gaze_files, 2 * round(0.4 * scene.width)
     files = {**scene.content.files, "gaze": gaze_files.gaze, "rays": gaze_files.rays}
     out: list[Node] = [
         names.default(name, check_attribute(relative_path(file, folder)))
         for name, file in files.items()
-        if file is not None
+        if isinstance(file, Path)
     ]
     out += [
         names.default(name, value)
@@ -476,9 +481,9 @@ def _make_defaults(scene: SceneText, names: _SceneNames, folder: Path) -> list[N
 def _make_integrator(scene: SceneText, names: _SceneNames) -> Element:
     gaze_files = scene.gaze_files
     children: list[Node] = list(scene.content.integrator_children)
-    if gaze_files.gaze is not None:
+    if isinstance(gaze_files.gaze, Path):
         children.append(element("volume", prop("string", "filename", names.use("gaze")), name="gaze", type="gazefield"))
-    if gaze_files.rays is not None:
+    if isinstance(gaze_files.rays, Path):
         transforms = [] if gaze_files.align is None else [transform(matrix(gaze_files.align))]
         file = prop("string", "filename", names.use("rays"))
         children.append(element("volume", file, *transforms, name="kde", type="gazekde"))
@@ -569,8 +574,11 @@ def free_default_name(name: str, taken: frozenset[str]) -> str:
     return f"nerg_{name}" if name in taken else name
 
 
-def relative_path(path: Path, folder: Path) -> str:
+def relative_path(path: Path, folder: Path | None) -> str:
     """Return ``path`` relative to ``folder``, or absolute if the two have no common folder except the root."""
-    path, folder = Path(os.path.realpath(path)), Path(os.path.realpath(folder))
+    path = Path(os.path.realpath(path))
+    if folder is None:
+        return str(path)
+    folder = Path(os.path.realpath(folder))
     common = os.path.commonpath([path, folder])
     return os.path.relpath(path, folder) if common != os.path.dirname(common) else str(path)

@@ -15,7 +15,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.fields.gaze_base import GazeNetwork, tracking_suffix
 from nerg_mi.fields.radiance import RadianceNetwork
 from nerg_mi.files.html import key_value_table
-from nerg_mi.files.values import FilePath, to_path
+from nerg_mi.files.values import FilePath, hash_arrays, to_path
 from nerg_mi.tracking_kinds import read_tracking
 
 from .scene_loading import get_array_module
@@ -107,6 +107,11 @@ class TrainedField(Generic[Network]):
         """Number of trained weights."""
         parameters = self.network.parameters()
         return sum(int(np.prod(value.shape)) for name, value in parameters.items() if not name.startswith("voxels."))
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 (hex) of the weights."""
+        return hash_arrays({name: np.array(value) for name, value in self.network.parameters().items()})
 
     def save(self, path: FilePath, half: bool | None = None) -> Path:
         """Write a checkpoint (.safetensors) atomically.

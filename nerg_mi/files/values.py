@@ -7,11 +7,12 @@ or "", and what is no number or time is refused by name.
 from __future__ import annotations
 
 import datetime
+import hashlib
 import math
 import os
 import re
 import unicodedata
-from collections.abc import Iterable, Iterator, KeysView, Sequence, ValuesView
+from collections.abc import Iterable, Iterator, KeysView, Mapping, Sequence, ValuesView
 from numbers import Real
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -337,3 +338,12 @@ def to_path(path: str | os.PathLike) -> Path:
         return Path(path)
     except TypeError as error:
         raise NergError(f"a file must be given as a string or a path, got {type(path).__name__}") from error
+
+
+def hash_arrays(arrays: Mapping[str, np.ndarray]) -> str:
+    """Return the SHA-256 (hex) of arrays by name."""
+    digest = hashlib.sha256()
+    for name, array in sorted(arrays.items()):
+        digest.update(f"{name} {array.shape} {array.dtype}".encode())
+        digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,11 +15,12 @@ from nerg_mi.aoi.shares import COARSE, gaze_shares
 from nerg_mi.environment.bands import Channels, render_channels
 from nerg_mi.environment.environment import Environment
 from nerg_mi.environment.gaze import read_training_alignment
-from nerg_mi.environment.observers import support_of_rays, to_scene_frame
+from nerg_mi.environment.observers import ObserverChoice, support_of_rays, to_scene_frame
 from nerg_mi.environment.sampler import GazeSampler
-from nerg_mi.environment.scene_file import WrittenScene, write_scene
-from nerg_mi.environment.scene_loading import activate_mitsuba, list_library_versions, load_scene
-from nerg_mi.environment.scene_writer import free_default_name, project_to_pixel
+from nerg_mi.environment.scene_cameras import CameraChoice
+from nerg_mi.environment.scene_file import PlacedScene, open_shown, place_scene
+from nerg_mi.environment.scene_loading import activate_mitsuba, list_library_versions
+from nerg_mi.environment.scene_writer import project_to_pixel
 from nerg_mi.errors import parameter, translate_mitsuba_errors
 from nerg_mi.evaluation.gaze_report import GazeResults
 from nerg_mi.fields.gaze_base import tracking_suffix
@@ -29,9 +29,8 @@ from nerg_mi.figures.style import Provenance
 from nerg_mi.figures.style import versions as programs
 from nerg_mi.files.atomic import check_writable, file_sha256, write_text
 from nerg_mi.files.html import element
-from nerg_mi.files.values import FilePath
+from nerg_mi.files.values import FilePath, hash_arrays
 from nerg_mi.formats.boxes import Region
-from nerg_mi.formats.checkpoint import read_metadata
 from nerg_mi.interruption import Interruption
 from nerg_mi.progress import Progress, Reporter, SilentReporter, open_reporter
 from nerg_mi.ranges import COORDINATES, FIELDS_OF_VIEW, SEEDS, SPP, Range, check_ranges
@@ -273,26 +272,22 @@ class ReportBuilder:
         labels = ParticipantLabels(self.rays, results)
         rays = self.rays if self.rays is None or settings.show_names else anonymize_rays(self.rays, labels)
         hide = (lambda text: text) if settings.show_names else labels.anonymize
-        with tempfile.TemporaryDirectory() as folder:
-            scene = self._scene(Path(folder))
-            views = self._views(scene, rendered)
-            environment = self._environment(scene)
-            sampler = make_report_sampler(
-                self.field, environment, self.training.get("probes", {}).get("depth", "median")
-            )
-            viewpoints = self._viewpoints(environment, scene)
-            # The observer was reported with the scene.
-            if not sampler.describe_extrapolation(self._observer(scene).positions):
-                if sentence := sampler.describe_extrapolation(viewpoints.positions):
-                    self.reporter.warn(sentence)
-            objects = observed = self._aoi_attention(areas, sampler, environment, viewpoints, self.rays)
-            if self.rays is not None and settings.observer is not None:
-                observed = self._aoi_attention(areas, sampler, environment, self._observer(scene), None)
-            stage, sizes = self._stage(scene, sampler, environment, viewpoints, areas.boxes)
-            files = self._list_inputs(scene, areas, Path(folder))
-            inputs = tuple((role, hide(name), digest) for role, name, digest in files)
-            kind, description = environment.kind, _describe_environment(scene.environment, Path(folder))
-            gaze_metadata, field_metadata = _read_metadata(scene)
+        scene = self._scene()
+        views = self._views(scene, rendered)
+        environment = self._environment(scene)
+        sampler = make_report_sampler(self.field, environment, self.training.get("probes", {}).get("depth", "median"))
+        viewpoints = self._viewpoints(environment, scene)
+        # The observer was reported with the scene.
+        if not sampler.describe_extrapolation(self._observer(scene).positions):
+            if sentence := sampler.describe_extrapolation(viewpoints.positions):
+                self.reporter.warn(sentence)
+        objects = observed = self._aoi_attention(areas, sampler, environment, viewpoints, self.rays)
+        if self.rays is not None and settings.observer is not None:
+            observed = self._aoi_attention(areas, sampler, environment, self._observer(scene), None)
+        stage, sizes = self._stage(scene, sampler, environment, viewpoints, areas.boxes)
+        source, gaze = scene.shown.environment, self.inputs.gaze
+        files = self._list_inputs(source, areas)
+        inputs = tuple((role, hide(name), digest) for role, name, digest in files)
         versions = list_library_versions(str(mi.variant()))
         record = Provenance("nerg report", {n: d for _, n, d in inputs}, settings.seed, settings.describe(), programs())
         pictures = draw_views(views, gaze_vmax(views.images), environment.has_surfaces, record)
@@ -306,14 +301,16 @@ class ReportBuilder:
                 self.rays, viewpoints.positions, environment, radius if isinstance(radius, (int, float)) else 0.5
             )
         shown = results if settings.show_names else [anonymize_results(r, labels) for r in results]
-        path = self.inputs.gaze.path
+        path = gaze.path
         name = "Gaze field" if path is None else f"The gaze field “{path.stem}”{tracking_suffix(self.training)}"
+        provenance = {**(source.metadata if path is None else {}), **gaze.provenance}
+        radiance = source.radiance
         return Run(
             settings.title or hide(name),
-            gaze_metadata,
-            hide(description),
-            kind,
-            field_metadata,
+            {"architecture": self.field.architecture(), "box": self.field.box.to_dict(), "provenance": provenance},
+            hide(source.description),
+            environment.kind,
+            {} if radiance is None else {"box": radiance.network.box.to_dict(), "provenance": radiance.provenance},
             describe_observer(scene, settings.observer is not None),
             rays,
             None if rays is None else summarise(rays),
@@ -334,17 +331,18 @@ class ReportBuilder:
             observed,
         )
 
-    def _list_inputs(self, scene: WrittenScene, areas: Areas, folder: Path) -> list[tuple[str, str, str]]:
-        """Return role, name and SHA-256 of each input; ``folder`` has the files of those in memory."""
-        describe = lambda role, path: (role, _name_file(path, folder), file_sha256(path))
-        environment, rays = scene.environment, self.inputs.rays
-        assert scene.gaze is not None and scene.gaze.path is not None
-        out = [describe("gaze field", scene.gaze.path)]
+    def _list_inputs(self, environment: Environment, areas: Areas) -> list[tuple[str, str, str]]:
+        """Return role, name and SHA-256 of each input: of its file, or of the arrays in memory."""
+        gaze, rays = self.inputs.gaze, self.inputs.rays
+        describe = lambda role, path: (role, path.name, file_sha256(path))
+        kind = _ROLES.get(environment.kind, environment.kind)
+        out = [("gaze field", _IN_MEMORY, gaze.digest) if gaze.path is None else describe("gaze field", gaze.path)]
         if environment.path is not None:
-            out.append(describe(_ROLES.get(environment.kind, environment.kind), environment.path))
+            out.append(describe(kind, environment.path))
+        elif environment.has_surfaces:
+            out.append((kind, _IN_MEMORY, environment.digest))
         if isinstance(rays, Rays):
-            rays.save(folder / "rays.npz")
-            out.append(describe("rays", folder / "rays.npz"))
+            out.append(("rays", _IN_MEMORY, hash_arrays(rays.columns())))
         elif rays is not None:
             out.append(("rays", Path(rays).name, hash_rays(rays)))
         files = [e for e in self.inputs.evaluations if isinstance(e, Path)]
@@ -355,41 +353,29 @@ class ReportBuilder:
         self.stop.check()
         self.reporter.progress(share, text)
 
-    def _scene(self, folder: Path) -> WrittenScene:
-        """Write the scene of the geometry and the gaze field to ``folder``."""
+    def _scene(self) -> PlacedScene:
+        """Place the observer and the camera among the geometry and the gaze field."""
         self._step(0.05, "looking for a camera")
         settings, inputs = self.settings, self.inputs
         observer = settings.observer
         if observer is None and self.rays is not None:
             observer = tuple(to_scene_frame(support_of_rays(self.rays).find_densest_position(), self.align).tolist())
-        scene = write_scene(
-            inputs.gaze,
-            folder / "scene.xml",
-            environment=inputs.environment,
-            observer=observer,
-            camera=settings.camera,
-            target=settings.target,
-            fov=settings.fov,
-            width=settings.width,
-            progress=_Quiet(self.reporter),
-        )
-        if scene.observer is None:
+        shown = open_shown(inputs.gaze, inputs.environment, reporter=_Quiet(self.reporter))
+        cameras = CameraChoice(settings.camera, settings.target, fov=settings.fov)
+        scene = place_scene(shown, ObserverChoice(observer), cameras, settings.width, reporter=_Quiet(self.reporter))
+        if scene.text.observer is None:
             self.reporter.message(
                 "no recorded positions are known: the camera is the observer; use "
                 f"{parameter('observer', 'x,y,z')} to place one"
             )
         return scene
 
-    def _load(self, scene: WrittenScene, **values: object):
-        named = {free_default_name(name, scene.reserved_names): str(value) for name, value in values.items()}
-        return load_scene(scene.path, named)
-
-    def _views(self, scene: WrittenScene, rendered: Mapping[str, Channels] | None) -> RenderedViews:
+    def _views(self, scene: PlacedScene, rendered: Mapping[str, Channels] | None) -> RenderedViews:
         """Render the camera, the observer's view and the sphere."""
         settings = self.settings
         spread = len(self.field.members) > 1
         aovs = "depth,opacity,gaze,visibility" + (",gaze_std" if spread else "")
-        loaded = self._load(scene, aovs=aovs, sphere_width=settings.width, sphere_height=settings.width // 2)
+        loaded = scene.load(aovs=aovs, sphere_width=settings.width, sphere_height=settings.width // 2)
         views = dict(rendered or {})
         for number, name in enumerate(VIEWS):
             if name in views:
@@ -401,29 +387,29 @@ class ReportBuilder:
                 )
         views = {name: smooth_gaze(views[name], loaded, loaded.sensors()[number]) for number, name in enumerate(VIEWS)}
         marker = None
-        if scene.observer is not None:
+        if scene.text.observer is not None:
             camera, width = loaded.sensors()[0], views["camera"].mask.shape[1]
             pixel = project_to_pixel(camera, sensor_center(loaded.sensors()[1]))
             share = width / camera.film().crop_size()[0]
             marker = None if pixel is None else tuple((v + 0.5) * share - 0.5 for v in pixel)
         return RenderedViews(views, marker, is_supported(loaded, loaded.sensors()[0]), describe_basis(loaded))
 
-    def _environment(self, scene: WrittenScene) -> Environment:
+    def _environment(self, scene: PlacedScene) -> Environment:
         """Return the geometry of the scene, in which depths are traced."""
-        if not scene.environment.has_surfaces:
+        if not scene.shown.environment.has_surfaces:
             return Environment(None, self.field.box, "none", align=self.align)
-        loaded = self._load(scene, radiance="false", aovs="opacity")
+        loaded = scene.load(radiance="false", aovs="opacity")
         geometry = SceneGeometry(loaded.integrator().medium, loaded)
-        return Environment(geometry, self.field.box, scene.environment.kind, align=self.align)
+        return Environment(geometry, self.field.box, scene.shown.environment.kind, align=self.align)
 
-    def _viewpoints(self, environment: Environment, scene: WrittenScene) -> EyePositions:
+    def _viewpoints(self, environment: Environment, scene: PlacedScene) -> EyePositions:
         """Return recorded positions, or that of the observer."""
         if self.rays is not None:
             return sample_eye_positions(self.rays, environment, self.settings.viewpoints)
         return self._observer(scene)
 
-    def _observer(self, scene: WrittenScene) -> EyePositions:
-        at = scene.camera if scene.observer is None else scene.observer
+    def _observer(self, scene: PlacedScene) -> EyePositions:
+        at = scene.text.camera if scene.text.observer is None else scene.text.observer
         return EyePositions(np.asarray(at.origin, float)[None], np.zeros(1, int))
 
     def _aoi_attention(
@@ -442,7 +428,7 @@ class ReportBuilder:
 
     def _stage(
         self,
-        scene: WrittenScene,
+        scene: PlacedScene,
         sampler: GazeSampler,
         environment: Environment,
         viewpoints: EyePositions,
@@ -455,13 +441,13 @@ class ReportBuilder:
             return empty
         # The up direction is that of the rays.
         settings, up = self.settings, self.align.matrix[:3, 2] / self.align.scale
-        at = np.asarray((scene.observer or scene.camera).origin, float)
+        at = np.asarray((scene.text.observer or scene.text.camera).origin, float)
         standing = viewpoints.positions
         if self.rays is None:
             box = self.field.box.core
             corners = np.array(box.lower, float), np.array(box.upper, float)
             standing = np.concatenate([at[None], find_free_positions(sampler, corners, up, at)])
-        loaded = self._load(scene, aovs="opacity,position")
+        loaded = scene.load(aovs="opacity,position")
         farthest = (
             standing[farthest_point_sampling(standing, OBSERVERS - 1, first=at)]
             if self.rays is not None
@@ -483,47 +469,25 @@ class ReportBuilder:
         if proxy is None:
             return empty
         paths = collect_paths(self.rays, environment) if self.rays is not None and settings.paths else []
-        camera = ReportCamera(np.asarray(scene.camera.origin, float), np.asarray(scene.camera.target, float))
+        camera = ReportCamera(np.asarray(scene.text.camera.origin, float), np.asarray(scene.text.camera.target, float))
         packed = pack_stage(Stage(proxy, observers, paths, boxes, up, camera))
         return packed, (len(observers), len(paths), len(proxy.vertices), len(boxes))
 
 
 class _Quiet(SilentReporter):
-    """Passes on warnings only: messages would name temporary files."""
+    """Passes on warnings only: the report has its own progress."""
 
     def __init__(self, reporter: Reporter):
-        self._reporter = reporter
-
-    def warn(self, text: str) -> None:
-        self._reporter.warn(text)
+        self.warn = reporter.warn
 
 
 # ---- Texts on the scene and the observer ----
 
 
-def _name_file(path: Path, folder: Path) -> str:
-    """Return the name of a file; those in ``folder`` are objects in memory."""
-    return _IN_MEMORY if path.parent == folder else path.name
-
-
-def _read_metadata(scene: WrittenScene) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the metadata of the gaze field and of the radiance field; those are empty for other environments."""
-    path = scene.environment.path
-    is_trained = path is not None and path.suffix.lower() == ".safetensors"
-    assert scene.gaze is not None and scene.gaze.path is not None
-    return read_metadata(scene.gaze.path), read_metadata(path) if is_trained and path is not None else {}
-
-
-def _describe_environment(environment: Environment, folder: Path) -> str:
-    """Describe the environment in a sentence; files in ``folder`` are objects in memory."""
-    is_in_memory = environment.path is not None and environment.path.parent == folder
-    return (replace(environment, path=None) if is_in_memory else environment).description
-
-
-def describe_observer(scene: WrittenScene, is_given: bool) -> str:
+def describe_observer(scene: PlacedScene, is_given: bool) -> str:
     """Describe the observer in a sentence; ``is_given`` tells whether its position was given."""
-    if scene.observer is None:
+    if scene.text.observer is None:
         return "The camera is the observer, because no recorded positions are known."
-    at = ", ".join(f"{v:.2f}" for v in scene.observer.origin)
+    at = ", ".join(f"{v:.2f}" for v in scene.text.observer.origin)
     where = "at the given position" if is_given else "where the density of rays is highest"
     return f"The observer is {where}, ({at})."

@@ -13,7 +13,7 @@ from tests.conftest import ROOT
 
 STUDY = """
 import json, os, sys
-import numpy as np, pandas as pd, trimesh
+import matplotlib.font_manager, numpy as np, pandas as pd, trimesh  # Matplotlib writes its cache when it is imported
 import nerg_mi as nerg
 written = []
 
@@ -44,8 +44,9 @@ scene = nerg.make_scene(room, gaze, camera=nerg.Camera((1, 1, 2), (5, 2, 1), wid
 picture = nerg.render(scene, [(2, 2, 1.6)], spp=1)
 share = nerg.attention(scene, [[5.9, 1, 1], [6.1, 3, 2]], [(2, 2, 1.6)]).share
 result = nerg.statistics([rays, gaze], {"window": [[5.9, 1, 1], [6.1, 3, 2]]}, resamples=199, viewpoints=4)
+report = nerg.report([gaze, rays], observer=(2, 2, 1.6), width=24, spp=1, viewpoints=2, max_points=200).html
 row = result.aois[0]
-extra = {"interval": [row["share_low"], row["share_high"]]}
+extra = {"interval": [row["share_low"], row["share_high"]], "html": report[:15]}
 print(json.dumps({"written": written, "kld": scores.rows[0]["KLD"], "share": share.tolist(), **extra}))
 """
 
@@ -57,5 +58,5 @@ def test_a_study_of_a_data_frame_and_a_mesh_writes_no_file(tmp_path):
     done = subprocess.run([sys.executable, "-c", STUDY], capture_output=True, text=True, cwd=tmp_path, env=environment)
     assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout.splitlines()[-1])
-    assert result["written"] == [] and not list(tmp_path.iterdir())
+    assert result["html"] == "<!DOCTYPE html>" and result["written"] == [] and not list(tmp_path.iterdir())
     assert result["kld"] > 0 and 0 < result["share"][0] < 1 and result["interval"][0] < result["interval"][1]

@@ -11,10 +11,17 @@ import pytest
 import trimesh
 
 from nerg_mi.environment import scene_file
+from nerg_mi.environment.arrays import Camera
 from nerg_mi.environment.bands import render_channels
+from nerg_mi.environment.contents import DensityGrid
 from nerg_mi.environment.environment import Environment, make_hit_geometry
+from nerg_mi.environment.gaze import GazeField
+from nerg_mi.environment.observers import ObserverChoice
+from nerg_mi.environment.radiance import RadianceField
 from nerg_mi.environment.rendering_files import read_frames
-from nerg_mi.environment.scene_file import write_scene
+from nerg_mi.environment.scene import make_scene
+from nerg_mi.environment.scene_cameras import CameraChoice
+from nerg_mi.environment.scene_file import open_shown, place_scene, write_scene
 from nerg_mi.environment.scene_loading import load_scene
 from nerg_mi.errors import NergError
 from nerg_mi.fields.radiance import RadianceConfig, RadianceNetwork
@@ -362,6 +369,68 @@ def test_a_folder_with_the_output_name_is_refused(parquet, rgb, tmp_path):
     (tmp_path / "a.rays.npz").mkdir()
     with pytest.raises(NergError, match=r"a\.rays\.npz"):
         write_scene(tmp_path / "shop.rays", tmp_path / "a.xml")
+
+
+# ---- Scenes in memory ----
+
+
+def objects_in_memory():
+    """Environments that have no file, of each kind."""
+    room = trimesh.creation.box((4, 4, 4))
+    cube = {"type": "cube", "to_world": rgb_scale(2), "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse"}}}
+    density = np.pad(np.zeros((6, 6, 6)), 1, constant_values=9)
+    shell = DensityGrid(density, (-2, -2, -2), (2, 2, 2), np.full((*density.shape, 3), 0.4))
+    config = RadianceConfig(fields.GRID, width=16, geometry=3, sh_degree=2, density_scale=6.0)
+    field = RadianceNetwork.random(config, Box((-2, -2, -2), (2, 2, 2)), _ns(), march_step=0.1)
+    return {
+        "mesh": room,
+        "meshes": trimesh.Scene(
+            [room, trimesh.creation.box((1, 1, 1), trimesh.transformations.translation_matrix((1, 1, -1)))]
+        ),
+        "scene": {"type": "scene", "cube": cube},
+        "nerg": make_scene(shell, headlight=0.3, camera=Camera((0, 0, 0), (1, 0, 0), width=9, height=6)),
+        "grid": shell,
+        "field": RadianceField(field),
+        "splats": Splats(
+            fibonacci_directions(500) * 2, [[0.1] * 3] * 500, [[1, 0, 0, 0]] * 500, [0.99] * 500, np.ones((500, 1, 3))
+        ),
+        "hits": make_hit_geometry(rays(), 0.1),
+    }
+
+
+def rgb_scale(factor):
+    import mitsuba as mi
+
+    return mi.ScalarTransform4f().scale(factor)
+
+
+@pytest.mark.parametrize("kind", ["mesh", "meshes", "scene", "nerg", "grid", "field", "splats", "hits"])
+def test_a_scene_in_memory_shows_what_its_file_shows(rgb, folder, tmp_path, kind):
+    environment, eye = objects_in_memory()[kind], (0.3, 0.2, 0.1)
+    inputs = [environment, GazeField.load(folder / "gaze.safetensors")]
+    before = set(tmp_path.iterdir())
+    placed = place_scene(open_shown(inputs), ObserverChoice(eye), CameraChoice((0, 0, 0.5), (2, 0.1, 0)), width=18)
+    scene = placed.load(**SMALL)
+    assert set(tmp_path.iterdir()) == before
+    written = write_scene(inputs, tmp_path / "a.xml", observer=eye, camera=(0, 0, 0.5), target=(2, 0.1, 0), width=18)
+    for number in range(3):
+        _, image = shown(written.path, number)
+        memory = render_channels(scene, scene.sensors()[number])
+        assert image.mask.any()
+        np.testing.assert_allclose(memory.color, image.color, atol=1e-3)
+        for name, values in image.aovs.items():
+            np.testing.assert_allclose(memory.aovs[name], values, atol=1e-3, err_msg=name)
+
+
+def test_rays_in_memory_are_shown_in_memory(rgb, folder, tmp_path):
+    at = {"align": np.diag([2.0, 2, 2, 1])}
+    placed = place_scene(open_shown([folder / "mesh.ply", rays()], **at), ObserverChoice(None), CameraChoice(None), 18)
+    scene = placed.load(**SMALL)
+    written = write_scene([folder / "mesh.ply", rays()], tmp_path / "a.xml", **at, width=18)
+    assert [file.name for file in written.files] == ["a.xml", "a.rays.npz"]
+    np.testing.assert_allclose(placed.text.camera.origin, written.camera.origin)
+    memory = render_channels(scene, scene.sensors()[1]).aovs["kde"]
+    np.testing.assert_allclose(memory, shown(written.path, 1)[1].aovs["kde"], rtol=1e-4)
 
 
 # ---- Gaze and its environment ----
