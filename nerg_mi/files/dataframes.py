@@ -236,6 +236,16 @@ class DataFrameReader:
             raise NergError(f"a vector needs three columns, got {', '.join(map(repr, names))}")
         return np.stack([to_numbers(*self._column(name)) for name in names], axis=1)
 
+    def read_complete_rows(self, names: Sequence[str]) -> np.ndarray:
+        """Return the rows (n, C) in which all of these columns have numbers; none if a column has other values, or its
+        name is repeated."""
+        try:
+            rows = np.stack([self.read_numbers(name) for name in names], axis=1)
+        except NergError:
+            # Whether a column has numbers is what is asked.
+            return np.empty((0, len(names)))
+        return rows[np.isfinite(rows).all(axis=1)]
+
     def read_names(self, name: Any) -> np.ndarray:
         """Return the names (N,) of a column, "" where they are missing, see `nerg_mi.files.values.to_names`."""
         return to_names(*self._column(name))

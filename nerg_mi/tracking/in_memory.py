@@ -6,7 +6,7 @@ Implements the methods of `nerg_mi.tracking.rays.Rays` that need the modules abo
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -37,10 +37,12 @@ def from_arrays(
     tracking: str | None = None,
     frame: tuple[str, str, str] = ("z", "right", "m"),
     unused: Sequence[str] = (),
+    read_unused: Callable[[Sequence[str]], np.ndarray] = lambda names: np.empty((0, len(names))),
 ) -> Rays:
     """Make rays of arrays, see `Rays.from_arrays`.
 
-    ``frame`` are up axis, handedness and unit; ``unused`` are names of columns to report as unused.
+    ``frame`` are up axis, handedness and unit; ``unused`` are names of columns to report as unused, of which
+    ``read_unused`` returns the complete rows.
     """
     if tracking is not None:
         check_tracking(tracking)
@@ -59,7 +61,7 @@ def from_arrays(
         if not isinstance(array, str) and array.shape != expected:
             raise NergError(f"{name} must have the shape {expected}, one row for each of the times, got {array.shape}")
     builder = RaysBuilder(TrackingFrame(*frame))
-    builder.add_unused_columns(unused)
+    builder.add_data_frame(list(unused), read_unused)
     cohort = texts.get("cohorts")
     builder.add(
         t,
@@ -208,6 +210,7 @@ def from_dataframe(
         tracking=tracking,
         frame=frame,
         unused=[name for k, name in enumerate(reader.names) if k not in used],
+        read_unused=reader.read_complete_rows,
     )
     if tracking != "mixed" or not {"tracking", "participant"} <= values.keys():
         return rays

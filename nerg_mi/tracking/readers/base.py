@@ -25,7 +25,7 @@ from nerg_mi.tracking.rays import COLUMNS, FRAME, Rays, merge_tracking
 
 from .cells import MISSING_WORDS
 from .columns import ColumnFinder, may_be_validity_column, parse_time_unit
-from .head_frame import HeadFrameFinder
+from .head_frame import HeadFrameFinder, read_head_columns
 from .poses import FilledOriginFinder, find_fill_values, is_aimed
 from .tables import TableBlock, find_column, iterate_table, read_table_columns, split_component
 
@@ -195,7 +195,7 @@ class RaysBuilder:
         unused = [name for name in available if name and name not in used]
         self.add_unused_columns(unused)
         if header is None:
-            self._head_frames.add_table(path, unused)
+            self._head_frames.add_table(unused, functools.partial(read_head_columns, path))
         for name, tick in (clocks or {}).items():
             unit = parse_time_unit(name)
             if unit is not None and not math.isclose(unit, tick):
@@ -216,6 +216,11 @@ class RaysBuilder:
     def add_unused_columns(self, columns: Iterable[str]) -> None:
         """Add names of unused columns to the quality report."""
         self._unused_columns.update(dict.fromkeys(columns))
+
+    def add_data_frame(self, unused: list[str], read: Callable[[Sequence[str]], np.ndarray]) -> None:
+        """Add a table in memory with its ``unused`` columns; ``read`` returns the complete rows (n, C) of some."""
+        self.add_unused_columns(unused)
+        self._head_frames.add_table(unused, read)
 
     @property
     def on_bad_line(self) -> BadLineCallback | None:
@@ -443,7 +448,11 @@ class RaysBuilder:
                 f"{', '.join(map(repr, unused_validity[:3]))}{suffix} may mark valid rows by their names, but are "
                 f"not used; use it with {parameter('columns')} and {parameter('valid')}"
             )
-        for sentence in self._head_frames.describe():
+        remedy = f"{parameter('columns')}; nerg rays guess proposes a column map"
+        if not self._sources:
+            self._head_frames.end_source("")
+            remedy = "import_rays does so for a table in a file"
+        for sentence in self._head_frames.describe(remedy):
             self.add_warning(sentence)
         metadata = {
             "frame": dict(FRAME),

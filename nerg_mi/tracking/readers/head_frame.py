@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.errors import parameter, sanitize
+from nerg_mi.errors import sanitize
 
 from . import poses
 from .columns import HEAD_WORDS, ROTATION_WORDS, SIDE_WORDS, find_head_positions, find_roles, split_stem
@@ -36,13 +36,13 @@ class HeadFrameFinder:
         self._begin()
 
     def _begin(self) -> None:
-        self._tables: list[tuple[Path, list[str]]] = []
+        self._tables: list[tuple[list[str], Callable[[Sequence[str]], np.ndarray]]] = []
         self._box = np.empty((0, 3))  # lowest and highest origin
         self._direction_sum, self._num_rows = np.zeros(3), 0
 
-    def add_table(self, path: Path, unused_columns: list[str]) -> None:
-        """Add a table of the current source."""
-        self._tables.append((path, unused_columns))
+    def add_table(self, unused_columns: list[str], read: Callable[[Sequence[str]], np.ndarray]) -> None:
+        """Add a table of the current source; ``read`` returns the complete rows (n, C) of some of its columns."""
+        self._tables.append((unused_columns, read))
 
     def add_rays(self, origin: np.ndarray, direction: np.ndarray | None) -> None:
         """Add the origins (n, 3) in the file and the unit directions (n, 3) of rays of the current source; None if they
@@ -66,25 +66,24 @@ class HeadFrameFinder:
     def has_fixed_origins(self) -> bool:
         return any(what.startswith("origins") for what, *_ in self._fixed)
 
-    def describe(self) -> Iterator[str]:
-        """Sentences for the quality report."""
+    def describe(self, remedy: str) -> Iterator[str]:
+        """Sentences for the quality report; ``remedy`` is what combines the gaze with the head."""
         for (what, verb, *names), files in self._fixed.items():
             more = f" and {len(files) - _MAX_NAMES} more files" if len(files) > _MAX_NAMES else ""
             which = "" if len(files) == self._num_sources else f" of {', '.join(files[:_MAX_NAMES])}{more}"
             columns = ", ".join(sanitize(name, 40) for name in names)
             yield (
                 f"all {what.replace(' ', which + ' ', 1)}, while {columns} {verb}: the gaze is in the head's "
-                f"frame; combine it with the head's position and rotation ({parameter('columns')}; nerg rays guess "
-                "proposes a column map)"
+                f"frame; combine it with the head's position and rotation ({remedy})"
             )
 
     def _find_moving_position(self) -> tuple[str, ...] | None:
         if not len(self._box) or np.ptp(self._box, axis=0).max() * self._metre > _MAX_EXTENT:
             return None
-        for path, columns in self._tables:
+        for columns, read in self._tables:
             vectors = find_roles(columns).vectors
             for stem in find_head_positions(vectors):
-                if poses.is_fixed(self._box, _read_columns(path, vectors[stem])):
+                if poses.is_fixed(self._box, read(vectors[stem])):
                     place = ", ".join(f"{v:.3g}" for v in self._box.mean(axis=0) + 0.0)
                     return f"origins are {place}", "move", *vectors[stem]
         return None
@@ -93,17 +92,17 @@ class HeadFrameFinder:
         length = float(np.linalg.norm(self._direction_sum)) / max(self._num_rows, 1)
         if self._num_rows < _MIN_ROWS or length < _MIN_CONCENTRATION:
             return None
-        for path, columns in self._tables:
+        for columns, read in self._tables:
             roles = find_roles(columns)
             for stem, names in (*roles.quaternions.items(), *roles.vectors.items()):
                 words = split_stem(stem)
                 if words & ROTATION_WORDS and words & HEAD_WORDS and not words & SIDE_WORDS:
-                    if _measure_concentration(_read_columns(path, names)) < _MAX_CONCENTRATION:
+                    if _measure_concentration(read(names)) < _MAX_CONCENTRATION:
                         return "directions stay around one axis", "turn", *names
         return None
 
 
-def _read_columns(path: Path, names: Sequence[str]) -> np.ndarray:
+def read_head_columns(path: Path, names: Sequence[str]) -> np.ndarray:
     """Complete rows (n, C) of columns of numbers in the first blocks of a table."""
     blocks = iterate_table(path, names, on_bad_line=lambda line, reason: None)
     values = [block.numbers for block in itertools.islice(blocks, _MAX_BLOCKS)]

@@ -6,6 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from nerg_mi.tracking.guess import propose_import
 from nerg_mi.tracking.quality import summarise
+from nerg_mi.tracking.rays import Rays
 from nerg_mi.tracking.readers.columns import ColumnMap
 from tests.tracking.readers.examples import read
 
@@ -46,6 +47,25 @@ def test_origins_that_stay_while_the_head_moves(tmp_path, eye, jitter, head):
     mapping = "origin=gaze_origin_x,gaze_origin_y,gaze_origin_z direction=gaze_forward_x,gaze_forward_y,gaze_forward_z"
     (warning,) = read_warnings(path, "table", columns=ColumnMap.parse(mapping), up="y", handedness="left")
     assert f"{head}_x, {head}_y, {head}_z move" in warning
+
+
+@pytest.mark.parametrize("library", ["pandas", "polars", "pyarrow"])
+def test_data_frames_are_compared_with_their_unused_columns(library):
+    position, angles, gaze = make_walk()
+    turned = Rotation.from_euler("YXZ", angles).apply(gaze)
+    make = {"pandas": "DataFrame", "polars": "DataFrame", "pyarrow": "table"}[library]
+    table = getattr(pytest.importorskip(library), make)
+    for origin, direction, expected in (
+        (np.full((COUNT, 3), 0.01), gaze, ["HMD_position_x, HMD_position_y, HMD_position_z move"]),
+        (position, gaze, ["HMD_rotation_x, HMD_rotation_y, HMD_rotation_z turn"]),
+        (position, turned, []),
+    ):
+        vectors = {"HMD_position": position, "HMD_rotation": angles, "origin": origin, "direction": direction}
+        columns = {f"{stem}_{axis}": values for stem, m in vectors.items() for axis, values in zip("xyz", m.T)}
+        other = {"Head_position_x": ["seated"] * COUNT, "time": np.arange(COUNT) / 100}
+        rays = Rays.from_dataframe(table(columns | other))
+        warnings = [w for w in summarise(rays).warnings if "the gaze is in the head's frame" in w]
+        assert len(warnings) == len(expected) and all(e in w for e, w in zip(expected, warnings))
 
 
 def test_files_with_fixed_origins_are_named(tmp_path):
