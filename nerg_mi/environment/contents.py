@@ -26,6 +26,7 @@ from nerg_mi.formats.meshes import MeshFile, read_mesh_file, with_shading_normal
 from nerg_mi.formats.splats import choose_plugin, write_ply_splats
 from nerg_mi.formats.surfaces import write_volume
 from nerg_mi.maths.color import decode_srgb
+from nerg_mi.maths.transforms import check_rigid_transforms
 from nerg_mi.properties import resolve_scene_file
 from nerg_mi.registration import PLUGINS, get_plugin_class
 from nerg_mi.tracking.rays import Rays
@@ -283,6 +284,8 @@ def from_trimesh(shape: trimesh.Trimesh | trimesh.Scene, name: str) -> dict[str,
         to_scene, geometry = shape.graph[node]  # pyright: ignore[reportAttributeAccessIssue] of a scene
         mesh = shape.geometry[geometry]  # pyright: ignore[reportAttributeAccessIssue] of a scene
         if hasattr(mesh, "faces"):
+            # trimesh ignores the last row.
+            check_rigid_transforms(to_scene, f'the transform of the node "{node}"', tolerance=np.inf)
             meshes[str(node)] = _convert_mesh(mesh.copy().apply_transform(to_scene), str(node))
     if not meshes:
         raise NergError("the trimesh.Scene contains no mesh with faces; add one")
@@ -421,6 +424,10 @@ def _load_values(content: Mapping[str, Any]) -> dict[str, Any]:
         # Mitsuba reports missing files.
         if os.path.exists(file):
             check_mesh(file, kind)
+    for key, value in content.items():
+        # Mitsuba applies transposed matrices as they are. That of a texture is smaller.
+        if hasattr(value, "matrix") and (pose := np.array(value.matrix, float)).size == 16:
+            check_rigid_transforms(pose.reshape(4, 4), f'"{key}" of the dict of a "{kind}"', tolerance=np.inf)
 
     def load(name: str, value: Any) -> Any:
         if isinstance(value, MeshFile):

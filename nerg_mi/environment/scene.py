@@ -43,7 +43,7 @@ from .contents import (
 from .hits import NO_DATA_GREY, read_hit_volume, shade_hits
 from .kinds import detect_kind
 from .nested_scene import make_paths_absolute, read_scene_elements, to_verbatim
-from .scene_loading import activate_mitsuba, load_scene
+from .scene_loading import activate_mitsuba, check_sensor, load_scene
 from .scene_writer import compute_clip_distances, format_document
 from .trained import TrainedField
 
@@ -112,6 +112,8 @@ class Scene:
         self.check_variant()
         for shape in mitsuba.shapes():
             check_shape(shape)
+        for index, sensor in enumerate(mitsuba.sensors()):
+            check_sensor(sensor, f"the to_world of sensor {index}")
         self.path: Path | None = None
         self._content: dict[str, Any] | None = None
         self.source: tuple[Path, dict[str, str]] | None = None
@@ -371,6 +373,7 @@ class Scene:
             with translate_mitsuba_errors():
                 return self._fit_clip_distances(mi.load_dict(camera.to_dict()), camera)
         if isinstance(camera, mi.Sensor):
+            check_sensor(camera, "the to_world of the camera")
             return camera
         if not (camera is None or isinstance(camera, (int, np.integer))):
             raise NergError(f"a camera must be a Camera, an index or a Mitsuba sensor, got {type(camera).__name__}")

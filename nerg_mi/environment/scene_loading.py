@@ -101,9 +101,7 @@ def check_scene(path: str | Path, scene) -> None:
     for shape in scene.shapes():
         check_shape(shape, f' of "{path}"', check_merged=True)
     for index, sensor in enumerate(scene.sensors()):
-        pose, name = np.array(sensor.world_transform().matrix, float).reshape(4, 4), f"the to_world of sensor {index}"
-        check_rigid_transforms(pose, f'{name} of "{path}"', tolerance=np.inf)
-        check_coordinates(pose[:3, 3:].T, f'{name} of "{path}"')
+        check_sensor(sensor, f'the to_world of sensor {index} of "{path}"')
         film, count = sensor.film(), sensor.sampler().sample_count()
         width, height = map(int, film.crop_size())
         if not 0 < width * height <= MAX_PIXELS:
@@ -112,6 +110,13 @@ def check_scene(path: str | Path, scene) -> None:
                 f"{MAX_PIXELS:,} pixels"
             )
         check_samples(count, f'the sampler of sensor {index} of "{path}"')
+
+
+def check_sensor(sensor, name: str) -> None:
+    """Raise `NergError` if the matrix of a sensor, ``name`` in the message, is no pose, or too far away."""
+    pose = np.array(sensor.world_transform().matrix, float).reshape(4, 4)
+    check_rigid_transforms(pose, name, tolerance=np.inf)
+    check_coordinates(pose[:3, 3:].T, name)
 
 
 def check_samples(count: int, subject: str) -> None:

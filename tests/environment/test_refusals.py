@@ -1,8 +1,9 @@
-"""Cameras without a centre, and scenes of another Mitsuba variant."""
+"""Cameras without a centre, scenes of another Mitsuba variant, and matrices that are no transforms."""
 
 import mitsuba
 import numpy as np
 import pytest
+import trimesh
 
 import nerg_mi as nerg
 from nerg_mi.errors import NergError, translate_mitsuba_errors
@@ -98,6 +99,46 @@ def test06_dicts_without_a_plugin_or_values_are_refused(write, content, name, rg
     for call in (nerg.Scene.coerce, lambda surface: nerg.attention(scene, surface, (0, -3, 0))):
         with pytest.raises(NergError, match=f"{name}|mesh"):
             call(content)
+
+
+def _load_node(matrix):
+    room = trimesh.Scene()
+    room.add_geometry(trimesh.creation.box((1, 1, 1)), transform=matrix)
+    return nerg.make_scene(shapes=room)
+
+
+ENTRIES = {
+    "node of trimesh": _load_node,
+    "shape": lambda matrix: nerg.make_scene(shapes={"type": "cube", "to_world": to_mitsuba(matrix)}),
+    "camera": lambda matrix: nerg.make_scene(shapes=CUBE, camera=make_sensor(matrix)),
+    "scene": lambda matrix: nerg.Scene.coerce(NERG | {"camera": make_sensor(matrix)}),
+    "scene of Mitsuba": lambda matrix: nerg.Scene(mitsuba.load_dict(NERG | {"camera": make_sensor(matrix)})),
+    "sensor": lambda m: nerg.render(nerg.Scene.coerce(NERG), camera=mitsuba.load_dict(make_sensor(m)), spp=1),
+}
+CUBE = {"type": "cube"}
+NERG = {"type": "scene", "integrator": {"type": "nerg"}, "cube": CUBE}
+
+
+def to_mitsuba(matrix):
+    return mitsuba.ScalarTransform4f(matrix.tolist())
+
+
+def make_sensor(matrix):
+    film = {"type": "hdrfilm", "width": 2, "height": 2}
+    return {"type": "perspective", "to_world": to_mitsuba(matrix), "film": film}
+
+
+@pytest.mark.parametrize("entry", ENTRIES)
+def test_matrices_in_memory_have_the_last_row_of_a_transform(rgb, entry):
+    """Mitsuba and trimesh use others as they are."""
+    matrix = np.eye(4)
+    matrix[:3, 3] = 1, 2, -3
+    ENTRIES[entry](matrix)
+    with pytest.raises(NergError, match="transpose"):
+        ENTRIES[entry](matrix.T)
+    matrix[3, 3] = 2
+    with pytest.raises(NergError, match="last row"):
+        ENTRIES[entry](matrix)
 
 
 @pytest.mark.parametrize("name", ["room.stl", "room.fbx", "room", "rays.npz", "gaze.safetensors"])
