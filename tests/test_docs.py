@@ -17,8 +17,7 @@ import typer
 import nerg_mi as nerg
 import nerg_mi.cli
 from nerg_mi.cli.building import find_commands
-from nerg_mi.tracking.readers.base import FROM_RECORDINGS
-from nerg_mi.tracking.readers.registry import iterate_readers, list_reader_names
+from nerg_mi.tracking.readers.registry import list_reader_names
 from nerg_mi.transport.march_primal import MarchSettings
 from tests.conftest import ROOT
 from tools import command_pages, generated, reference
@@ -146,12 +145,6 @@ def test10_the_architecture_lists_all_packages():
 def test11_commands_of_the_readme_exist():
     said = set(re.findall(r"^\| `nerg (\w+)", (ROOT / "README.md").read_text("utf-8"), re.M))
     assert said and said <= {name.split()[0] for name in find_commands()}
-
-
-def test_the_readme_counts_the_readers():
-    text = " ".join((ROOT / "README.md").read_text(encoding="utf-8").split())
-    tested = [reader for reader in iterate_readers() if reader.evidence.startswith(FROM_RECORDINGS)]
-    assert f"Of {len(list_reader_names())} readers, {NUMBERS[len(tested)]} were tested on real recordings" in text
 
 
 @pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md", "CHANGELOG.md"])

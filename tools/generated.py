@@ -26,7 +26,10 @@ def devices() -> str:
 
     summarise = lambda files: re.split(r"[:;(]|, (?!and)", files)[0].strip()
     rows = [(f"`{reader.name}`", summarise(reader.files), reader.evidence) for reader in iterate_readers()]
-    return table(("preset", "files", "evidence"), sorted(rows, key=lambda row: not row[2].startswith(FROM_RECORDINGS)))
+    rows.sort(key=lambda row: not row[2].startswith(FROM_RECORDINGS))
+    tested = sum(row[2].startswith(FROM_RECORDINGS) for row in rows)
+    count = f"Of {len(rows)} readers, {tested} were tested on real recordings of their device."
+    return f"{count}\n\n{table(('preset', 'files', 'evidence'), rows)}"
 
 
 def registered() -> str:
