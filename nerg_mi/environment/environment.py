@@ -189,7 +189,7 @@ class Environment:
             described = {"geometry_file": opened.metadata["geometry_file"] | self.metadata["geometry_file"]}
             return replace(opened, align=self.align, metadata=described)
         kind = detect_kind(path)
-        metadata = {**self.metadata, _FILES[kind].key: identify_file(path)}
+        metadata = {**self.metadata, FILES[kind].key: identify_file(path)}
         return replace(self, kind=kind, path=path, source=None, metadata=metadata)
 
     def save_beside(self, checkpoint: Path) -> Environment:
@@ -205,7 +205,8 @@ class Environment:
     @property
     def description(self) -> str:
         """What is shown, in a sentence."""
-        return _DESCRIPTIONS[self.kind].format("in memory" if self.path is None else self.path.name)
+        text = FILES[self.kind].description if self.kind in FILES else _DESCRIPTIONS[self.kind]
+        return text.format("in memory" if self.path is None else self.path.name)
 
     def to_scene_content(self, output: Path | None = None) -> SceneContent:
         """Return what shows the environment in the scene file ``output``, or in a scene in memory.
@@ -216,7 +217,7 @@ class Environment:
         if self.kind == "none":
             return show_directions(DEFAULT_DEPTH)
         if self.path is not None:
-            return _FILES[self.kind].show(self.path, output)
+            return FILES[self.kind].show(self.path, output)
         assert output is None, "environments in memory are saved first"
         return _show_source(self)
 
@@ -262,12 +263,12 @@ class Environment:
 def _open_file(path: Path, keep_shapes: bool = False) -> Environment:
     """Open an environment in a file. Raises `NergError` for a file with anything else."""
     kind = detect_kind(path)
-    if kind not in _FILES:
+    if kind not in FILES:
         raise NergError(
             f'"{path}" contains {"rays" if kind == "rays" else "a gaze field"} and is no environment; {_CHOICES}'
         )
-    opened = _FILES[kind].open(path, keep_shapes)
-    return replace(opened, kind=kind, path=path, metadata={_FILES[kind].key: identify_file(path) | opened.metadata})
+    opened = FILES[kind].open(path, keep_shapes)
+    return replace(opened, kind=kind, path=path, metadata={FILES[kind].key: identify_file(path) | opened.metadata})
 
 
 def _open_field_file(path: Path, keep_shapes: bool) -> Environment:
@@ -363,33 +364,35 @@ def no_geometry(origins: np.ndarray) -> Environment:
 
 
 @dataclass(frozen=True)
-class _EnvironmentFile:
+class EnvironmentFile:
     """What files of one kind contain: how they are opened, and shown in the scene file ``output``."""
 
     open: Callable[[Path, bool], Environment]  # of a file, and whether shapes keep their names
     show: Callable[[Path, Path | None], SceneContent]  # of a file and ``output``
     key: str  # of the file in the provenance
+    description: str  # of what is shown, in a sentence with the name of the file
 
 
-_FILES = {
-    "field": _EnvironmentFile(_open_field_file, show_field, "field_file"),
-    "splats": _EnvironmentFile(lambda path, keep_shapes: _open_splats(read_splats(path)), show_field, "field_file"),
-    "mesh": _EnvironmentFile(_open_mesh_file, show_mesh, "scene_file"),
-    "scene": _EnvironmentFile(_open_scene_file, lambda path, output: nest_scene(path), "scene_file"),
-    "hits": _EnvironmentFile(_open_volume, show_hits, "geometry_file"),
+FILES = {
+    "field": EnvironmentFile(_open_field_file, show_field, "field_file", "A radiance field trained on photos, {}."),
+    "splats": EnvironmentFile(
+        lambda path, keep_shapes: _open_splats(read_splats(path)), show_field, "field_file", "Gaussian splats, {}."
+    ),
+    "mesh": EnvironmentFile(_open_mesh_file, show_mesh, "scene_file", "The mesh {}."),
+    "scene": EnvironmentFile(
+        _open_scene_file, lambda path, output: nest_scene(path), "scene_file", "The Mitsuba scene {}."
+    ),
+    "hits": EnvironmentFile(
+        _open_volume,
+        show_hits,
+        "geometry_file",
+        "The scene consists of the hit points of rays, {}, in grey; there are no photos of it.",
+    ),
 }
 """Files of environments, by their kind (`kinds.detect_kind`)."""
 
-_DESCRIPTIONS = {
-    "field": "A radiance field trained on photos, {}.",
-    "splats": "Gaussian splats, {}.",
-    "mesh": "The mesh {}.",
-    "scene": "The Mitsuba scene {}.",
-    "grid": "A grid of densities, {}.",
-    "hits": "The scene consists of the hit points of rays, {}, in grey; there are no photos of it.",
-    "none": "There is no geometry: only directions are shown.",
-}
-"""What is shown of an environment with a name, by its kind."""
+_DESCRIPTIONS = {"grid": "A grid of densities, {}.", "none": "There is no geometry: only directions are shown."}
+"""What is shown of an environment that has no file, by its kind."""
 
 
 def identify_file(path: Path) -> dict[str, str]:

@@ -26,13 +26,10 @@ from nerg_mi.tracking.dataset import open_rays
 from nerg_mi.tracking.rays import Rays, sample_rows
 
 from .arrays import Floats, as_points, as_rays
-from .environment import Environment
+from .environment import FILES, Environment
 from .scene import AnyEnvironment, ObserverSpace, Scene
 from .scene_loading import get_array_module
 from .trained import TrainedField
-
-_FILES = ("field_file", "scene_file", "geometry_file")
-"""Keys of the file of the environment in the provenance."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -570,4 +567,4 @@ def read_training_alignment(provenance: Mapping[str, Any]) -> Similarity:
 
 def find_environment_record(provenance: Mapping[str, Any]) -> Mapping[str, Any] | None:
     """Return the name (``file``) and the checksum (``sha256``) of the environment of a gaze field, or None."""
-    return next((provenance[key] for key in _FILES if key in provenance), None)
+    return next((provenance[file.key] for file in FILES.values() if file.key in provenance), None)

@@ -20,8 +20,6 @@ from nerg_mi.fields.splats import Splats
 from nerg_mi.files.atomic import check_writable, write_text
 from nerg_mi.files.html import key_value_table
 from nerg_mi.files.values import FilePath, to_numbers
-from nerg_mi.formats.meshes import READERS as MESHES
-from nerg_mi.formats.splats import is_splat_file
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.types import Axes, Figure, MitsubaScene, Sensor
 from nerg_mi.registration import get_plugin_class
@@ -41,7 +39,7 @@ from .contents import (
     write_content,
 )
 from .hits import NO_DATA_GREY, read_hit_volume, shade_hits
-from .kinds import detect_kind
+from .kinds import ROLES, detect_kind
 from .nested_scene import make_paths_absolute, read_scene_elements, to_verbatim
 from .scene_loading import activate_mitsuba, check_sensor, load_scene
 from .scene_writer import compute_clip_distances, format_document
@@ -480,26 +478,32 @@ def make_scene(
     integrator: dict[str, Any] = {"type": "nerg", **settings}
     transform = None if to_world is None else _as_transform(to_world)
     children: dict[str, Any] = {}
-    content = find_content(environment)
+    content, kind = find_content(environment), ""
+    if isinstance(environment, (str, os.PathLike)):
+        kind = _find_kind(environment, "environment")
+    if kind in ROLES:
+        contained = "rays" if kind == "rays" else "a gaze field, which goes with gaze="
+        raise NergError(f'"{environment}" contains {contained}; pass an environment')
+    if isinstance(environment, TrainedField) and environment.kind == "gaze":
+        raise NergError("the environment is a gaze field; pass it with gaze=")
     if content is not None:
         children = {k: v for k, v in content.items() if k != "type" and (camera is None or find_tag(v) != "sensor")}
         name = next(name for name, child in children.items() if find_tag(child) == "integrator")
         # The quantities of a scene without gaze are not those of one with gaze.
         left_out = ("type", "aovs") if gaze is not None else ("type",)
         integrator |= {k: v for k, v in children.pop(name).items() if k not in left_out} | settings
-    elif isinstance(environment, (str, os.PathLike)) and Path(environment).suffix.lower() == ".vol":
-        integrator = _make_hit_volumes(_find_file(environment, "environment"), transform) | integrator
+    elif kind == "hits":
+        integrator = _make_hit_volumes(Path(environment), transform) | integrator
     elif isinstance(environment, DensityGrid):
         integrator = dict(environment.volumes(transform)) | integrator
-    elif _is_field(environment):
-        if isinstance(environment, (str, os.PathLike)):
-            environment = _resolve_field(environment, "environment", "field")
+    elif kind in ("field", "splats") or isinstance(environment, (TrainedField, Splats)):
         integrator["field"] = FieldVolume(environment, "field", transform)
     elif environment is not None:
-        children = _take_shapes(environment)
+        children = _take_shapes(environment, kind)
     if gaze is not None:
         if isinstance(gaze, (str, os.PathLike)):
-            gaze = _resolve_field(gaze, "gaze", "gaze")
+            if (contained := _find_kind(gaze, "gaze")) != "gaze":
+                raise NergError(f'gaze must be a gaze field, but "{gaze}" contains {contained}; pass another file')
         elif not isinstance(gaze, TrainedField) or gaze.kind != "gaze":
             raise NergError(f"gaze must be a gaze field, in memory or as a file, got {gaze!r}")
         integrator["gaze"] = FieldVolume(gaze, "gaze", transform)
@@ -591,12 +595,17 @@ def find_content(environment: AnyEnvironment) -> dict[str, Any] | None:
     return dict(environment) if is_scene and has_nerg(environment) else None
 
 
-def _take_shapes(environment: AnyEnvironment) -> dict[str, Any]:
-    """The shapes and lights of an environment by name. Raises `NergError` for a loaded scene with a field."""
+def _take_shapes(environment: AnyEnvironment, kind: str) -> dict[str, Any]:
+    """The shapes and lights of an environment by name; ``kind`` is that of a file. Raises `NergError` for a loaded
+    scene with a field."""
     import mitsuba as mi
 
-    if isinstance(environment, (str, os.PathLike)) and Path(environment).suffix.lower() == ".xml":
+    if kind == "scene":
         environment = load_scene(Path(environment))
+    elif kind and kind != "mesh":
+        from .environment import Environment  # the class above this module
+
+        environment = Environment.open(environment).scene_geometry.scene
     elif isinstance(environment, Scene):
         environment = environment.mitsuba
     integrator: Any = environment.integrator() if isinstance(environment, mi.Scene) else None
@@ -608,33 +617,11 @@ def _take_shapes(environment: AnyEnvironment) -> dict[str, Any]:
     return to_scene_children(environment, "environment")
 
 
-def _is_field(value: object) -> bool:
-    """Whether ``value`` is a radiance field or splats, in memory or by the suffix of a file."""
-    if isinstance(value, (str, os.PathLike)):
-        path = Path(value)
-        return path.suffix.lower() not in (*MESHES, ".xml") or (path.is_file() and is_splat_file(path))
-    if isinstance(value, TrainedField) and value.kind == "gaze":
-        raise NergError("the environment is a gaze field; pass it with gaze=")
-    return isinstance(value, (TrainedField, Splats))
-
-
-def _find_file(value: str | os.PathLike, name: str) -> Path:
-    """Return the file of an argument. Raises `NergError` if it does not exist."""
+def _find_kind(value: str | os.PathLike, name: str) -> str:
+    """Return what the file of an argument contains (`detect_kind`). Raises `NergError` if it does not exist."""
     if not os.path.exists(value):
         raise MissingFile(f'the file "{os.fspath(value)}" of "{name}" does not exist; correct the path')
-    return Path(value)
-
-
-def _resolve_field(value: str | os.PathLike, name: str, kind: str) -> Path:
-    """Return the file of an argument. Raises `NergError` unless it contains a field of this kind (`detect_kind`)."""
-    path = _find_file(value, name)
-    content = detect_kind(path)
-    if content != kind and not (kind, content) == ("field", "splats"):
-        names = {"field": "a radiance field or splats", "gaze": "a gaze field"}
-        raise NergError(
-            f'{name} must be {names[kind]}, but "{path}" contains {names.get(content, content)}; pass another file'
-        )
-    return path
+    return detect_kind(Path(value))
 
 
 def _make_hit_volumes(path: Path, to_world: Any) -> dict[str, Any]:

@@ -8,8 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from nerg_mi.environment.arrays import Camera
 from nerg_mi.environment.contents import DensityGrid
-from nerg_mi.environment.environment import Environment, make_hit_geometry, no_geometry
+from nerg_mi.environment.environment import FILES, Environment, EnvironmentFile, make_hit_geometry, no_geometry
+from nerg_mi.environment.gaze import find_environment_record
 from nerg_mi.environment.hits import (
     DEFAULT_VOXEL,
     PADDING_VOXELS,
@@ -19,13 +21,19 @@ from nerg_mi.environment.hits import (
     shade_hits,
     voxelise_hits,
 )
+from nerg_mi.environment.kinds import KINDS
 from nerg_mi.environment.planned import PlannedFiles
 from nerg_mi.environment.radiance import RadianceField
+from nerg_mi.environment.scene import make_scene
+from nerg_mi.environment.scene_file import write_scene
 from nerg_mi.environment.scene_loading import list_scene_files
+from nerg_mi.environment.scene_writer import SceneContent, element, format_numbers, prop
 from nerg_mi.errors import NergError
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.fields.radiance import RadianceNetwork
 from nerg_mi.fields.splats import Splats, concatenate_splats
+from nerg_mi.figures.pictures import render
+from nerg_mi.files.atomic import file_sha256
 from nerg_mi.formats.fields import save_radiance
 from nerg_mi.formats.splats import write_ply_splats
 from nerg_mi.formats.surfaces import write_volume
@@ -45,6 +53,39 @@ def test_a_field_is_its_only_planned_file(tmp_path):
     (tmp_path / "field.safetensors").write_bytes(b"weights")
     planned = PlannedFiles.plan(tmp_path / "field.safetensors")
     assert planned.checked_path() == tmp_path / "field.safetensors" and len(planned.files.members) == 1
+
+
+def open_spheres(path, keep_shapes):
+    rows = np.loadtxt(path, ndmin=2)
+    shapes = {f"s{k}": {"type": "sphere", "center": row[:3].tolist(), "radius": row[3]} for k, row in enumerate(rows)}
+    return Environment.open({"type": "scene", **shapes})
+
+
+def show_spheres(path, output):
+    center = lambda row: element("point", name="center", value=format_numbers(row[:3]))
+    shapes = tuple(
+        element("shape", center(row), prop("float", "radius", row[3]), type="sphere")
+        for row in np.loadtxt(path, ndmin=2)
+    )
+    return SceneContent(scene_children=shapes, subject=f"The spheres {path.name}")
+
+
+def test_a_kind_of_environment_is_an_entry(rgb, tmp_path, monkeypatch):
+    """It is opened, recorded, shown in scenes in memory and in files, and found next to a gaze field."""
+    monkeypatch.setitem(KINDS, ".spheres", "spheres")
+    kind = EnvironmentFile(open_spheres, show_spheres, "scene_file", "The spheres {}.")
+    monkeypatch.setitem(FILES, "spheres", kind)
+    path = tmp_path / "a.spheres"
+    path.write_text("0 0 0 1\n3 0 0 1\n")
+    opened = Environment.open(path)
+    assert opened.kind == "spheres" and opened.description == "The spheres a.spheres."
+    assert opened.trace_depth(np.array([[-5.0, 0, 0]]), np.array([[1.0, 0, 0]])) == pytest.approx(4)
+    assert find_environment_record(opened.metadata) == {"file": "a.spheres", "sha256": file_sha256(path)}
+    view = {"camera": (-5.0, 0.0, 0.0), "target": (0.0, 0.0, 0.0), "width": 9}
+    written = write_scene(path, tmp_path / "a.xml", **view)
+    assert len(written.load().mitsuba.shapes()) == 2
+    made = make_scene(path, camera=Camera((-5, 0, 0), (0, 0, 0), width=9, height=9))
+    assert render(made, quantities="depth", spp=1).depth[0, 4, 4] == pytest.approx(4, abs=0.05)
 
 
 # ---- Geometries of distant hit points: an office with windows, in closed form ----
