@@ -19,7 +19,6 @@ from typing import Any, cast, get_type_hints
 
 from nerg_mi.errors import NergError, parameter
 from nerg_mi.options import (
-    MAIN,
     OUTPUT,
     TRAINING,
     best_variant,
@@ -90,7 +89,7 @@ def make_command(row: Row) -> Command:
             if kinds[name] == tuple[str, ...]:
                 text = re.sub(r"( Default: .*)?$", r" Repeatable.\1", text, count=1)
             look: dict[str, Any] = {"metavar": "KEY=VALUE"} if parse is parse_definitions else {}
-            group = headings.get(name, MAIN)
+            group = headings.get(name, row.rest)
             made = option(default, text, *names, within=ranges.get(name), parse=parse, group=group, **look)
             members.append((name, kinds[name], made))
     device: dict[str, Any] = {"threads": ("int | None", cpu_threads())} if row.threads else {}

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from nerg_mi.options import ANALYSIS, INPUT, MODEL, OUTPUT, PERFORMANCE, TEST, TRAINING, VIEW
+from nerg_mi.options import ANALYSIS, INPUT, MAIN, MODEL, OUTPUT, PERFORMANCE, TEST, TRAINING, VIEW
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Row:
     If ``--output`` is not given, files are written next to the first argument, with ``default_suffix``. A command that
     ``computes`` has ``--mode``, by default LLVM, or the ``fastest`` variant that works, and one with ``threads`` has
     ``--threads``. ``spellings`` are those of options that have more than their name. ``groups`` are the headings of
-    help under which keywords are listed, those that are not named under the first. A command is ``without`` the options
+    help under which keywords are listed, and ``rest`` is that of the others. A command is ``without`` the options
     of these parameters and fields, which only developers and experts set, in Python. A command that
     ``prints`` its result, a list of reports (their method ``to_text``), needs no output. A command with ``presets`` has
     the options of all readers of tracking files (`.presets`). The result of a command that ``waits`` serves until
@@ -47,6 +47,7 @@ class Row:
     threads: bool = False
     spellings: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    rest: str = MAIN
     without: tuple[str, ...] = ()
     default_suffix: str = ""
     prints: bool = False
@@ -60,9 +61,9 @@ _FIGURE = "Figure to write (.png, .svg or .pdf)."
 _OF_SCENES = {"defaults": ("-D", "--define"), "sensor": ("-s", "--sensor"), "persons": ("--person",)}
 
 _OF_TRAINING = {
+    MAIN: ("environment",),
     INPUT: ("align",),
     MODEL: ("recipe", "variant", "ensemble", "reaimed_hits"),
-    TRAINING: ("steps", "minutes", "radius", "min_rays"),
     TEST: ("folds", "splits", "test_zones", "test_positions", "test_participants"),
 }
 
@@ -229,11 +230,8 @@ TABLE = (
         ("rays",),
         "Gaze field to write (.safetensors).",
         spellings={"environment": ("-e", "--environment")},
-        groups={
-            **_OF_TRAINING,
-            INPUT: ("align", "force", "views", "salience", "align_views"),
-            TRAINING: ("steps", "minutes", "seed", "radius", "min_rays", "resume"),
-        },
+        groups={**_OF_TRAINING, INPUT: ("align", "force", "views", "salience", "align_views")},
+        rest=TRAINING,
         without=(
             "probes",
             "directions",
@@ -298,6 +296,7 @@ TABLE = (
         "Folder for the tables.",
         spellings={"environment": ("-e", "--environment")},
         groups=_OF_TRAINING,
+        rest=TRAINING,
         without=(
             "probes",
             "directions",
