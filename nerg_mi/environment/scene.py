@@ -603,9 +603,9 @@ def _take_shapes(environment: AnyEnvironment, kind: str) -> dict[str, Any]:
     if kind == "scene":
         environment = load_scene(Path(environment))
     elif kind and kind != "mesh":
-        from .environment import Environment  # the class above this module
+        import nerg_mi  # the class above this module
 
-        environment = Environment.open(environment).scene_geometry.scene
+        environment = nerg_mi.Environment.open(environment).scene_geometry.scene
     elif isinstance(environment, Scene):
         environment = environment.mitsuba
     integrator: Any = environment.integrator() if isinstance(environment, mi.Scene) else None
