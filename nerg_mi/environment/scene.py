@@ -478,9 +478,9 @@ def make_scene(
     integrator: dict[str, Any] = {"type": "nerg", **settings}
     transform = None if to_world is None else _as_transform(to_world)
     children: dict[str, Any] = {}
-    content, kind = find_content(environment), ""
+    content, kind, path = find_content(environment), "", Path()
     if isinstance(environment, (str, os.PathLike)):
-        kind = _find_kind(environment, "environment")
+        path, kind = Path(environment), _find_kind(environment, "environment")
     if kind in ROLES:
         contained = "rays" if kind == "rays" else "a gaze field, which goes with gaze="
         raise NergError(f'"{environment}" contains {contained}; pass an environment')
@@ -493,7 +493,7 @@ def make_scene(
         left_out = ("type", "aovs") if gaze is not None else ("type",)
         integrator |= {k: v for k, v in children.pop(name).items() if k not in left_out} | settings
     elif kind == "hits":
-        integrator = _make_hit_volumes(Path(environment), transform) | integrator
+        integrator = _make_hit_volumes(path, transform) | integrator
     elif isinstance(environment, DensityGrid):
         integrator = dict(environment.volumes(transform)) | integrator
     elif kind in ("field", "splats") or isinstance(environment, (TrainedField, Splats)):
