@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import numpy as np
 
@@ -84,7 +83,7 @@ def draw_sheet(
     """
     changed = changed_arguments(draw_sheet, locals())
     check_figure(output)
-    paths = _list_images([images] if isinstance(images, (str, os.PathLike)) else images)
+    paths = _list_images(cast("Sequence[FilePath]", images if isinstance(images, (list, tuple)) else [images]))
     shown = None if overlay is None else find_channel_overlay(overlay)
     with open_reporter(progress) as reporter:
         if shown is None:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Sequence
 from types import ModuleType
-from typing import Annotated
+from typing import Annotated, cast
 
 import numpy as np
 
@@ -272,7 +271,7 @@ def train_prior(
     >>> prior.kind, len(prior.provenance["places"])
     ('gaze', 1)
     """
-    sources = [rays] if isinstance(rays, (str, os.PathLike, Rays)) else rays
+    sources = cast("Sequence[Rays | FilePath]", rays if isinstance(rays, (list, tuple)) else [rays])
     if not sources:
         raise NergError("a prior needs rays of other scenes: give at least one file")
     recordings, files = [], []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import re
 import signal
@@ -544,6 +545,17 @@ def test_tables_in_place_of_rays_are_refused_with_the_way_to_rays(gaze, room):
             call()
     with pytest.raises(nerg.NergError, match="columns="):
         nerg.Rays.from_dataframe(table)
+
+
+@pytest.mark.parametrize("name", [n for n in nerg.__all__ if n.islower() and not n.startswith("register_")])
+def test_other_objects_as_the_first_argument_are_refused(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    function = getattr(nerg, name)
+    parameters = list(inspect.signature(function).parameters.values())[1:]
+    required = {p.name: "missing.npz" for p in parameters if p.default is p.empty and p.kind is not p.VAR_KEYWORD}
+    for value in (3, object(), pytest.importorskip("pandas").DataFrame({"x": [0.0]})):
+        with pytest.raises(nerg.NergError):
+            function(value, **required)
 
 
 def test_objects_in_place_of_outputs_are_refused(gaze, room):
