@@ -13,7 +13,7 @@ from nerg_mi.errors import NergError, sanitize
 from nerg_mi.files.tables import unescape_formula
 from nerg_mi.files.values import to_name
 from nerg_mi.formats.boxes import Region
-from nerg_mi.tracking.dataset import RayDataset, is_dataset
+from nerg_mi.tracking.dataset import RayDataset
 from nerg_mi.tracking.filters import argsort_by_person_time
 from nerg_mi.tracking.rays import Rays, merge_rays
 from nerg_mi.tracking.readers.columns import open_named_table
@@ -231,16 +231,12 @@ def find_area_visits(rays: Rays, context: AoiContext) -> dict[str, Visits]:
     return {name: v if order is None else replace(v, first=order[v.first]) for name, v in zip(names, visits)}
 
 
-def iter_blocks(
-    source: Rays | RayDataset | str | Path, rules: VisitRules, max_samples: int = BLOCK_SIZE
-) -> Iterator[Rays]:
-    """Yield the samples of a file or dataset in blocks of about ``max_samples`` that contain whole sessions.
+def iter_blocks(source: Rays | RayDataset, rules: VisitRules, max_samples: int = BLOCK_SIZE) -> Iterator[Rays]:
+    """Yield samples in blocks of about ``max_samples`` that contain whole sessions.
 
     Participants are sorted by name and their samples by time. The partition is deterministic. Raises `NergError` for
     samples that cannot be read.
     """
-    if isinstance(source, (str, Path)) and is_dataset(source):
-        source = RayDataset.open(source)
     if isinstance(source, RayDataset):
         data = source.require_single_place()
         parts = (
@@ -250,24 +246,9 @@ def iter_blocks(
         )
         yield from _split_at_sessions(parts, rules, max_samples)
         return
-    rays = source if isinstance(source, Rays) else Rays.load(source)
-    if not len(rays):
+    if not len(source):
         raise NergError("there are no gaze samples; import some, or relax the selection")
-    yield from _split_at_sessions(iter([((), rays)]), rules, max_samples)
-
-
-def list_cohorts(source: Rays | str | Path, first: Rays) -> tuple[str, ...]:
-    """Return the names of the cohorts of the samples; ``first`` is one block of them."""
-    if not isinstance(source, Rays) and is_dataset(source):
-        return tuple(sorted(RayDataset.open(source).cohorts))
-    return tuple(sorted(first.cohorts))
-
-
-def count_rays(source: Rays | str | Path) -> int:
-    """Return the number of samples."""
-    if isinstance(source, Rays):
-        return len(source)
-    return len(RayDataset.open(source)) if is_dataset(source) else len(Rays.load(source))
+    yield from _split_at_sessions(iter([((), source)]), rules, max_samples)
 
 
 def _split_at_sessions(parts: Iterator[tuple[tuple, Rays]], rules: VisitRules, max_samples: int) -> Iterator[Rays]:

@@ -25,6 +25,7 @@ from nerg_mi.progress import Progress, Reporter, open_reporter
 from nerg_mi.ranges import SEEDS, TIMES, Range, check_ranges
 from nerg_mi.tasks.parts import PartRunner
 from nerg_mi.tasks.settings import Parallel
+from nerg_mi.tracking.dataset import RayDataset, open_recordings
 from nerg_mi.tracking.pseudonyms import make_pseudonyms, read_salt
 from nerg_mi.tracking.rays import TRACKING, Rays
 from nerg_mi.transport.observer import sensor_center
@@ -32,7 +33,7 @@ from nerg_mi.transport.observer import sensor_center
 from .areas import AnyAreas, Areas, to_json_values
 from .changes import open_changes
 from .estimates import MIN_PARTICIPANTS
-from .measured import AoiContext, Counting, TimeWindow, count_block, count_rays, iter_blocks, list_cohorts
+from .measured import AoiContext, Counting, TimeWindow, count_block, iter_blocks
 from .output import StatisticsResult, has_parquet
 from .placed import PlacedAreas, open_placed_areas
 from .power import power_rows
@@ -207,7 +208,7 @@ def statistics(
         with _open_parts(chosen, areas, align, sampling, parallel, reporter) as parts:
             work = _Work(
                 open_placed_areas(chosen.environment, chosen.gaze, areas, align, sampling),
-                chosen.rays,
+                None if chosen.rays is None else open_recordings(chosen.rays),
                 counting,
                 parts,
                 MinParticipantsFilter(min_participants),
@@ -321,7 +322,7 @@ class _Work:
     """Computes the statistics; ``parts`` is None if all is computed in this process."""
 
     placed: PlacedAreas
-    rays: Path | Rays | None
+    rays: Rays | RayDataset | None
     counting: Counting
     parts: PartitionedStatistics | None
     floor: MinParticipantsFilter
@@ -365,8 +366,8 @@ class _Work:
         _report_small_groups(people, self.reporter)
         return _Attention(sums, viewpoints, predicted, people, times)
 
-    def _count(self, rays: Path | Rays, num_viewpoints: int) -> tuple[VisitSums, Viewpoints]:
-        context, count = self._make_context(rays), count_rays(rays)
+    def _count(self, rays: Rays | RayDataset, num_viewpoints: int) -> tuple[VisitSums, Viewpoints]:
+        context, count = self._make_context(rays), len(rays)
         picker = ViewpointSampler(max(1, count // num_viewpoints))
         has_gaze = self.placed.sampler is not None
 
@@ -385,7 +386,7 @@ class _Work:
             warn_few_viewpoints(viewpoints, self.reporter)
         return sums, viewpoints
 
-    def _make_context(self, rays: Path | Rays) -> AoiContext:
+    def _make_context(self, rays: Rays | RayDataset) -> AoiContext:
         first = next(iter_blocks(rays, self.counting.rules))
         has_surfaces = self.placed.environment.medium is not None
         hits = not has_surfaces and first.hit is not None and bool(np.isfinite(first.hit).any())
@@ -397,10 +398,10 @@ class _Work:
                 if hits
                 else "no scene is given: AOIs occlude each other, and nothing else does"
             )
-        return AoiContext(self.placed, self.counting, hits, list_cohorts(rays, first))
+        return AoiContext(self.placed, self.counting, hits, tuple(sorted(rays.cohorts)))
 
     def _count_blocks(
-        self, rays: Path | Rays, context: AoiContext, pick: Callable[[Rays], None], count: int
+        self, rays: Rays | RayDataset, context: AoiContext, pick: Callable[[Rays], None], count: int
     ) -> Iterator[VisitSums]:
         """Yield the sums of each block, computed in this process."""
         done = 0

@@ -23,7 +23,6 @@ from nerg_mi.tasks.task import RENDER_LIBRARIES, FileGroup, Part, Plan
 from nerg_mi.tracking.dataset import (
     DATASET_MANIFEST,
     RayDataset,
-    is_dataset,
     read_dataset_manifest,
     read_source_manifest,
     source_manifest_path,
@@ -206,7 +205,7 @@ class PartitionedStatistics:
     sampling: AoiSampling
 
     def count(
-        self, rays: Rays | Path, context: AoiContext, on_block: Callable[[Rays], None] | None
+        self, rays: Rays | RayDataset, context: AoiContext, on_block: Callable[[Rays], None] | None
     ) -> Iterator[VisitSums]:
         """Yield the sums of each block of samples, in the order of `iter_blocks`. ``on_block`` is called with each
         block before, in the same order."""
@@ -218,8 +217,8 @@ class PartitionedStatistics:
         )
         with self.parts.store.make_scratch_folder() as folder:
             parts = []
-            if not isinstance(rays, Rays) and is_dataset(rays):
-                data = RayDataset.open(rays).require_single_place()
+            if isinstance(rays, RayDataset):
+                data = rays.require_single_place()
                 for (source, part), group in _group_parts(data):
                     files = [data.folder / DATASET_MANIFEST, source_manifest_path(data.folder, source.id)]
                     files += [data.folder / p.path(source.id) for _, p in group]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -144,12 +144,12 @@ class VisitSums:
         The C cells.
     rows
         Cell and participant of each row.
-    time, squared_time
-        Sums of the represented times and of their squares, (R,).
-    rays, sessions
-        Numbers of samples and of sessions, (R,).
-    dwell_time, hit_rays
-        Represented time and number of the samples that hit the area, (R, A).
+    time
+        Represented time, (R,).
+    rays
+        Number of samples, (R,).
+    dwell_time
+        Represented time of the samples that hit the area, (R, A).
     distance
         Sum of represented time times hit distance, (R, A).
     visits
@@ -159,8 +159,6 @@ class VisitSums:
     first_visit_sum, first_visit_count
         Over sessions with a visit, the time from the first sample of the session in the cell to the first visit, and
         the number of these sessions, (R, A).
-    first_start, last_end
-        Start of the first visit and end of the last one, (R, A).
     duration_counts
         Histogram of visit durations over `BINS`, (C, A, bins).
     transitions
@@ -171,18 +169,13 @@ class VisitSums:
     cells: tuple[Cell, ...]
     rows: tuple[tuple[Cell, str], ...]
     time: np.ndarray
-    squared_time: np.ndarray
     rays: np.ndarray
-    sessions: np.ndarray
     dwell_time: np.ndarray
-    hit_rays: np.ndarray
     distance: np.ndarray
     visits: np.ndarray
     visible_time: np.ndarray
     first_visit_sum: np.ndarray
     first_visit_count: np.ndarray
-    first_start: np.ndarray
-    last_end: np.ndarray
     duration_counts: np.ndarray
     transitions: np.ndarray
 
@@ -191,8 +184,6 @@ class VisitSums:
         """Return zero sums with the given ``rows``."""
         R, A, C = len(rows), len(areas), len(cells)
         arrays = {name: np.zeros(R) for name in _PER_ROW} | {name: np.zeros((R, A)) for name in _PER_AREA}
-        arrays["first_start"] += np.inf
-        arrays["last_end"] -= np.inf
         counts, transitions = np.zeros((C, A, len(BINS) - 1)), np.zeros((C, A, A))
         return cls(tuple(areas), tuple(cells), tuple(rows), **arrays, duration_counts=counts, transitions=transitions)
 
@@ -202,71 +193,35 @@ class VisitSums:
         return np.array([r for _, r in rows], np.int64), [person for person, _ in rows]
 
 
-_PER_ROW = ("time", "squared_time", "rays", "sessions")
-_PER_AREA = (
-    "dwell_time",
-    "hit_rays",
-    "distance",
-    "visits",
-    "visible_time",
-    "first_visit_sum",
-    "first_visit_count",
-    "first_start",
-    "last_end",
-)
-_MINIMUM, _MAXIMUM = ("first_start",), ("last_end",)
-
-
-class Total:
-    """Running total of `VisitSums`."""
-
-    def __init__(self, areas: Sequence[str], cells: Sequence[Cell]):
-        self._areas, self._cells = tuple(areas), tuple(cells)
-        self._row_of: dict[tuple[Cell, str], int] = {}
-        # Grows geometrically, so that adding takes amortised time proportional to what is added.
-        self._buffer = VisitSums.empty(areas, cells)
-        self._capacity = 0
-
-    def add(self, part: VisitSums) -> None:
-        """Add ``part``. Raises ``ValueError`` if its areas or cells differ."""
-        if (part.areas, part.cells) != (self._areas, self._cells):
-            raise ValueError("sums with different areas or cells cannot be added")
-        for row in part.rows:
-            self._row_of.setdefault(row, len(self._row_of))
-        if len(self._row_of) > self._capacity:
-            self._grow(max(2 * self._capacity, len(self._row_of)))
-        rows = np.array([self._row_of[row] for row in part.rows], np.int64)
-        for name in (*_PER_ROW, *_PER_AREA):
-            out = getattr(self._buffer, name)
-            add = np.minimum if name in _MINIMUM else np.maximum if name in _MAXIMUM else np.add
-            out[rows] = add(out[rows], getattr(part, name))
-        self._buffer.duration_counts += part.duration_counts
-        self._buffer.transitions += part.transitions
-
-    def _grow(self, capacity: int) -> None:
-        new, old = VisitSums.empty(self._areas, self._cells, [(ALL, "")] * capacity), self._buffer
-        for name in (*_PER_ROW, *_PER_AREA):
-            getattr(new, name)[: self._capacity] = getattr(old, name)
-        new.duration_counts, new.transitions = old.duration_counts, old.transitions
-        self._buffer, self._capacity = new, capacity
-
-    def sums(self) -> VisitSums:
-        """Return a view of the total so far."""
-        n = len(self._row_of)
-        arrays = {name: getattr(self._buffer, name)[:n] for name in (*_PER_ROW, *_PER_AREA)}
-        other_arrays = dict(duration_counts=self._buffer.duration_counts, transitions=self._buffer.transitions)
-        return VisitSums(self._areas, self._cells, tuple(self._row_of), **arrays, **other_arrays)
+_PER_ROW = ("time", "rays")
+_PER_AREA = ("dwell_time", "distance", "visits", "visible_time", "first_visit_sum", "first_visit_count")
 
 
 def merge_sums(sums: Iterable[VisitSums]) -> VisitSums:
     """Add one or more sums in the given order. Raises ``ValueError`` if areas or cells differ."""
-    total: Total | None = None
+    total: VisitSums | None = None
+    row_of: dict[tuple[Cell, str], int] = {}
     for part in sums:
-        total = total or Total(part.areas, part.cells)
-        total.add(part)
+        total = total or VisitSums.empty(part.areas, part.cells)
+        if (part.areas, part.cells) != (total.areas, total.cells):
+            raise ValueError("sums with different areas or cells cannot be added")
+        for row in part.rows:
+            row_of.setdefault(row, len(row_of))
+        if len(row_of) > len(total.time):
+            # Grows geometrically, so that adding takes amortised time proportional to what is added.
+            larger = VisitSums.empty(total.areas, total.cells, [(ALL, "")] * 2 * len(row_of))
+            for name in (*_PER_ROW, *_PER_AREA):
+                getattr(larger, name)[: len(total.time)] = getattr(total, name)
+            total = replace(larger, duration_counts=total.duration_counts, transitions=total.transitions)
+        rows = np.array([row_of[row] for row in part.rows], np.int64)
+        for name in (*_PER_ROW, *_PER_AREA):
+            getattr(total, name)[rows] += getattr(part, name)
+        total.duration_counts += part.duration_counts
+        total.transitions += part.transitions
     if total is None:
         raise ValueError("at least one sum is needed")
-    return total.sums()
+    used = {name: getattr(total, name)[: len(row_of)] for name in (*_PER_ROW, *_PER_AREA)}
+    return replace(total, rows=tuple(row_of), **used)
 
 
 def sum_visits(
@@ -353,12 +308,10 @@ def _add_rows(out: VisitSums, timeline: Timeline, mask: np.ndarray | None, table
     row = table[timeline.person] if mask is None else table[timeline.person[mask]]
     weight, t, session = (v if mask is None else v[mask] for v in (timeline.weight, timeline.t, timeline.session))
     _sum_into(out.time, row, weight)
-    _sum_into(out.squared_time, row, weight**2)
     _sum_into(out.rays, row)
     session_start = np.full(int(timeline.session[-1]) + 1 if len(timeline.t) else 0, np.inf)
     numbers, first = np.unique(session, return_index=True)
     session_start[numbers] = t[first]
-    _sum_into(out.sessions, row[first])
     return session_start
 
 
@@ -376,7 +329,6 @@ def _add_area(
     hit_rows, distance = hit_rows[subset], distance[subset]
     row, weight = table[timeline.person[hit_rows]], timeline.weight[hit_rows]
     _sum_into(out.dwell_time[:, a], row, weight)
-    _sum_into(out.hit_rays[:, a], row)
     _sum_into(out.distance[:, a], row, weight * distance)
     if is_visible is not None:
         visible_rows = np.flatnonzero(is_visible if mask is None else is_visible & mask)
@@ -395,8 +347,6 @@ def _add_visits(
 ) -> None:
     row = table[timeline.person[first]]
     _sum_into(out.visits[:, a], row)
-    np.minimum.at(out.first_start[:, a], row, start)
-    np.maximum.at(out.last_end[:, a], row, end)
     session, index = np.unique(timeline.session[first], return_index=True)
     _sum_into(out.first_visit_sum[:, a], row[index], start[index] - session_start[session])
     _sum_into(out.first_visit_count[:, a], row[index])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import fields, replace
+from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -160,13 +160,11 @@ def slow_sums(rays, on, far, visible, cells):
             who = rays.persons[person[k]]
             begin.setdefault(sitting[k], t[k])
             out["time", cell, who] += weight[k]
-            out["squared_time", cell, who] += weight[k] ** 2
             out["rays", cell, who] += 1
             for a in range(3):
                 i = order[k]
                 if on[i, a]:
                     out["dwell_time", cell, who, a] += weight[k]
-                    out["hit_rays", cell, who, a] += 1
                     out["distance", cell, who, a] += weight[k] * far[i, a]
                 if on[i, a] or visible[i, a]:
                     out["visible_time", cell, who, a] += weight[k]
@@ -180,8 +178,6 @@ def slow_sums(rays, on, far, visible, cells):
                     continue
                 who = rays.persons[person[first]]
                 out["visits", cell, who, a] += 1
-                out["first_start", cell, who, a] = min(out.get(("first_start", cell, who, a), np.inf), start)
-                out["last_end", cell, who, a] = max(out.get(("last_end", cell, who, a), -np.inf), end)
                 bin_ = max(b for b in range(len(BINS) - 1) if end - start >= BINS[b] - 1e-9)
                 out["lasted", cell, a, bin_] += 1
                 if sitting[first] not in expected:
@@ -231,21 +227,10 @@ def test_sums_match_loops(seed):
     sums = sum_visits(rays, landed, AREAS, cells, RULES, visible)
     slow = slow_sums(rays, on, far, visible, cells)
     for r, (cell, who) in enumerate(sums.rows):
-        for name in ("time", "squared_time", "rays"):
+        for name in ("time", "rays"):
             assert getattr(sums, name)[r] == pytest.approx(slow[name, cell, who])
-        for name in (
-            "dwell_time",
-            "hit_rays",
-            "distance",
-            "visits",
-            "visible_time",
-            "first_visit_sum",
-            "first_visit_count",
-        ):
+        for name in ("dwell_time", "distance", "visits", "visible_time", "first_visit_sum", "first_visit_count"):
             assert getattr(sums, name)[r] == pytest.approx([slow[name, cell, who, a] for a in range(3)]), name
-        for name, none in (("first_start", np.inf), ("last_end", -np.inf)):
-            expected = [slow.get((name, cell, who, a), none) for a in range(3)]
-            assert getattr(sums, name)[r] == pytest.approx(expected), name
     for c, (cell, _) in enumerate(cells):
         assert sums.duration_counts[c].tolist() == [
             [slow["lasted", cell, a, b] for b in range(len(BINS) - 1)] for a in range(3)
@@ -253,11 +238,7 @@ def test_sums_match_loops(seed):
         assert sums.transitions[c].tolist() == [[slow["moves", cell, a, b] for b in range(3)] for a in range(3)]
     assert {cell for cell, _ in sums.rows} == {cell for cell, _ in cells[:-1]} and sums.transitions[0].sum() > 3
     # Area c has no visit.
-    assert (
-        sums.dwell_time[:, 2].sum() == 0
-        and np.isinf(sums.first_start[:, 2]).all()
-        and sums.visible_time[:, 2].sum() > 0
-    )
+    assert sums.dwell_time[:, 2].sum() == 0 and sums.visible_time[:, 2].sum() > 0
 
 
 def pick(landed, rows):
@@ -284,21 +265,14 @@ def test_partition_does_not_change_sums():
             assert np.array_equal(getattr(merged, f.name), value), f.name
     # Nested partitions give bitwise equal sums in the same order.
     again = merge_sums([merge_sums(parts[:1]), *parts[1:]])
-    assert all(
-        np.array_equal(getattr(again, n), getattr(merged, n))
-        for n in ("time", "dwell_time", "transitions", "first_start")
-    )
+    assert all(np.array_equal(getattr(again, n), getattr(merged, n)) for n in ("time", "dwell_time", "transitions"))
 
 
 def test_returning_participant_is_counted_once():
     rays, landed, _, _, visible = made(3)
     one = sum_visits(rays, landed, AREAS, [(ALL, None)], RULES, visible)
     twice = merge_sums([one, one])
-    assert (
-        twice.rows == one.rows
-        and np.allclose(twice.time, 2 * one.time)
-        and np.array_equal(twice.first_start, one.first_start)
-    )
+    assert twice.rows == one.rows and np.allclose(twice.time, 2 * one.time)
 
 
 def test_incompatible_sums_are_refused():
@@ -309,22 +283,6 @@ def test_incompatible_sums_are_refused():
         merge_sums([one, other])
     with pytest.raises(ValueError, match="at least one sum"):
         merge_sums([])
-
-
-def test_last_visit_ends_with_its_last_sample():
-    """The end of the last visit is that of its last sample, also across two parts."""
-    t = np.arange(8) * 0.25
-    d = np.tile([1.0, 0, 0], (8, 1))
-    rays = Rays(t, np.zeros(8, int), ("ann",), d, d, np.ones(8))
-    on = np.array([1, 2, 5, 6])
-    landed = HitAssignment(8, (on,), (np.ones(4),))
-    early = sum_visits(rays, landed, ("a",), [(ALL, None)], VisitRules())
-    assert early.visits[0, 0] == 2
-    assert (early.first_start[0, 0], early.last_end[0, 0]) == pytest.approx((0.25, 1.75))
-    late = sum_visits(replace(rays, t=t + 100), landed, ("a",), [(ALL, None)], VisitRules())
-    for parts in ([early, late], [late, early]):
-        assert merge_sums(parts).first_start[0, 0] == pytest.approx(0.25)
-        assert merge_sums(parts).last_end[0, 0] == pytest.approx(101.75)
 
 
 def test_sums_without_samples():
