@@ -209,7 +209,7 @@ def facing_directions(rays: Rays) -> np.ndarray:
 
 
 def count_block(rays: Rays, context: AoiContext) -> VisitSums:
-    """Sum the visits of a block of samples that contains whole sessions.
+    """Sum the visits of a block of samples that contains whole sessions, sorted by participant and time.
 
     The result depends on the arguments only. `nerg_mi.aoi.visits.merge_sums` adds the results of the blocks in
     order.

@@ -302,8 +302,8 @@ MARGIN = 0.03  # default margin in metres, about the accuracy of surfaces in a r
 
 @dataclass(frozen=True)
 class HitAssignment:
-    """Hits of N samples on AOIs: for each AOI the ``rows`` of the samples that hit it, and the ``distance`` at which
-    they enter it.
+    """Hits of N samples on AOIs: for each AOI the ascending ``rows`` of the samples that hit it, and the ``distance``
+    at which they enter it.
 
     For a sample that starts inside an AOI, the distance is that of the surface it meets there.
     """

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from nerg_mi.tracking.filters import group_by_person
 from nerg_mi.tracking.rays import Rays
 
 from .placed import HitAssignment
@@ -113,8 +112,8 @@ def find_visits(rows: np.ndarray, timeline: Timeline, rules: VisitRules) -> Visi
 # Sums per participant, cell and area, which can be added up in any partition of the data.
 #
 # A *cell* is a subset of the data that is analysed separately: all samples, a cohort, a time window, or a zone of the
-# floor. A sample may belong to several cells. `sum_visits` accepts any block of samples that contains whole sessions,
-# in any order; `merge_sums` adds such sums. Added in the same order, they are bitwise equal for every partition of the
+# floor. A sample may belong to several cells. `sum_visits` accepts any block of samples that contains whole sessions;
+# `merge_sums` adds such sums. Added in the same order, they are bitwise equal for every partition of the
 # data. Memory is proportional to participants x cells x areas, and does not depend on the number of samples.
 
 BINS = np.array([0.0, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0, 60.0, np.inf])
@@ -238,9 +237,9 @@ def sum_visits(
     Parameters
     ----------
     rays
-        Gaze samples in any order.
+        Gaze samples, sorted by participant and time.
     hits
-        Hits on ``areas``, by row of ``rays``.
+        Hits on ``areas``, by ascending row of ``rays``.
     areas
         Names of the areas.
     cells
@@ -252,11 +251,8 @@ def sum_visits(
     transition_areas
         Indices of the areas between which transitions are counted. Default: all.
     """
-    order, _ = group_by_person(rays)
-    timeline = make_timeline(rays.person[order], rays.t[order], rules)
-    position = np.empty(len(order), np.int64)
-    position[order] = np.arange(len(order))
-    masks = [None if mask is None else mask[order] for _, mask in cells]
+    timeline = make_timeline(rays.person, rays.t, rules)
+    masks = [mask for _, mask in cells]
     keys, starts = [], []
     present = []
     for (cell, _), mask in zip(cells, masks):
@@ -273,13 +269,10 @@ def sum_visits(
         tables.append(table)
     session_starts = [_add_rows(out, timeline, mask, table) for mask, table in zip(masks, tables)]
     visits_of_areas = []
-    for a, (rows, distance) in enumerate(zip(hits.rows, hits.distance)):
-        hit_rows = position[rows]
-        by_row = np.argsort(hit_rows, kind="stable")
-        hit_rows, hit_distance = hit_rows[by_row], distance[by_row]
+    for a, (hit_rows, hit_distance) in enumerate(zip(hits.rows, hits.distance)):
         is_visible = None
         if visibility is not None:
-            is_visible = visibility[order, a].copy()
+            is_visible = visibility[:, a].copy()
             is_visible[hit_rows] = True
         visits = find_visits(hit_rows, timeline, rules)
         visits_of_areas.append(visits)

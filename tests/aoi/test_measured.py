@@ -95,7 +95,8 @@ def test_blocks_contain_whole_sessions_and_all_samples():
     rays = people(7, 60)
     # Two sessions per participant, separated by a pause of two minutes.
     rays = replace(rays, t=rays.t + 120.0 * (rays.t >= 6))
-    whole_result = merge_sums([count_block(rays, counting())])
+    in_order = rays.select(np.lexsort((rays.t, rays.person)))
+    whole_result = merge_sums([count_block(in_order, counting())])
     for max_count in (1, 50, 100, 10_000):
         blocks = list(iter_blocks(rays, RULES, max_count))
         assert sum(len(b) for b in blocks) == len(rays)

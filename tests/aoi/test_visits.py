@@ -127,14 +127,15 @@ AREAS = ("a", "b", "c")
 
 
 def made(seed=0, n=150, people=3):
-    """Unsorted samples with hits and visibility."""
+    """Samples, sorted by participant and time, with hits and visibility."""
     rng = np.random.default_rng(seed)
     person = rng.integers(0, people, n)
     step = rng.choice([0.1, 0.2, 0.2, 0.3, 0.7, 6.0], n)
     t = np.zeros(n)
     for p in range(people):
         subset = np.flatnonzero(person == p)
-        t[subset] = rng.permutation(np.cumsum(step[subset]))
+        t[subset] = np.cumsum(step[subset])
+    person, t = np.sort(person), t[np.argsort(person, kind="stable")]
     d = np.tile([1.0, 0, 0], (n, 1))
     names = tuple(f"person {k}" for k in range(people))
     rays = Rays(t, person, names, rng.random((n, 3)), d, np.ones(n))
