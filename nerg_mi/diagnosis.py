@@ -17,6 +17,7 @@ from nerg_mi.errors import format_error
 from nerg_mi.memory import MITSUBA_MEGABYTES, NUMPY_MEGABYTES, find_free_address_space
 
 from . import __version__, llvm
+from .progress import Progress
 
 EXTRAS = {
     "torch": 'for torch-ngp checkpoints and fields as torch modules: pip install "nerg-mi[torch]"',
@@ -85,7 +86,8 @@ class Diagnosis:
     findings: list[Finding] = field(default_factory=list)
     is_usable: bool = False
 
-    def __str__(self) -> str:
+    def to_text(self) -> str:
+        """Return one line for each finding, and one for each problem."""
         width = max(len(f.topic) for f in self.findings)
         lines = []
         for f in self.findings:
@@ -112,8 +114,11 @@ def try_backend(backend: str) -> dict:
     return {"variants": [], "failed": {backend: last_line}}
 
 
-def run_diagnosis() -> Diagnosis:
-    """Run all checks and return the report. Takes a few seconds."""
+def run_diagnosis(progress: Progress = None) -> Diagnosis:
+    """Check the installation and suggest fixes.
+
+    The exit code is 0 if a compiled variant of Mitsuba works, else 1.
+    """
     diagnosis = Diagnosis()
     add = diagnosis.findings.append
     core = (f"{name} {_version(name) or 'not installed'}" for name in ("mitsuba", "drjit"))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import importlib
 import pickle
 import re
 from pathlib import Path
@@ -12,7 +11,7 @@ import pytest
 
 import nerg_mi as nerg
 from nerg_mi.cli import main
-from nerg_mi.cli.building import choose_spelling, find_commands
+from nerg_mi.cli.building import choose_spelling
 from nerg_mi.errors import MissingFile, NergError, clean_text, parameter, sanitize, spell_command_line, spell_parameters
 
 
@@ -84,7 +83,6 @@ def test_messages_mention_parameters_and_no_options():
 
 def spelled(command, text):
     """Return ``text`` as the command line shows it."""
-    importlib.import_module(find_commands()[command].module)
     return clean_text(text, choose_spelling([*command.split(), "a", "-o", "b"]))
 
 

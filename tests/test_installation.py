@@ -458,7 +458,7 @@ def test24_problems_follow_their_topic():
     result = diagnosis.Diagnosis(
         [diagnosis.Finding("LLVM", "none", "install it"), diagnosis.Finding("threads", "2")], is_usable=False
     )
-    assert str(result) == "LLVM     none\n         -> install it\nthreads  2"
+    assert result.to_text() == "LLVM     none\n         -> install it\nthreads  2"
 
 
 WORKS = {"variants": ["llvm_ad_rgb"], "failed": {}, "threads": 2, "version": [19, 1, 7]}
@@ -472,8 +472,8 @@ def test25_verdict(monkeypatch, backend_state, verdict):
     monkeypatch.setattr(llvm, "has_cuda", lambda: False)
     monkeypatch.setattr(llvm, "find_problem", lambda: None)
     result = diagnosis.run_diagnosis()
-    assert result.is_usable is (backend_state is WORKS) and verdict in str(result)
-    assert ("it died" in str(result)) is (backend_state is NO_FINDINGS)
+    assert result.is_usable is (backend_state is WORKS) and verdict in result.to_text()
+    assert ("it died" in result.to_text()) is (backend_state is NO_FINDINGS)
 
 
 @pytest.mark.parametrize("version, is_tested", [("3.9.1", True), ("3.10.0", False), (None, True)])
@@ -488,7 +488,7 @@ def test28_untested_mitsuba_is_reported(monkeypatch, version, is_tested):
 def test26_old_driver_is_reported(monkeypatch, version, old):
     monkeypatch.setattr(diagnosis, "try_backend", lambda backend: {**WORKS, "version": version})
     monkeypatch.setattr(llvm, "has_cuda", lambda: True)
-    assert ("R570" in str(diagnosis.run_diagnosis())) is old
+    assert ("R570" in diagnosis.run_diagnosis().to_text()) is old
 
 
 HOLES = [

@@ -1,17 +1,14 @@
-"""The parser of the command line, built from the declarations of commands.
+"""The parser of the command line, built from the table of commands.
 
-Commands are found by the first lines of modules. Only the module of the called command is imported, so that ``nerg
---help`` is fast.
+Only the called command is built, so that ``nerg --help`` is fast.
 """
 
 from __future__ import annotations
 
-import importlib
 import inspect
-import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import Field, dataclass, fields
+from dataclasses import Field, fields
 from pathlib import Path
 from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
@@ -24,13 +21,10 @@ from nerg_mi.options import GROUPS as GROUPS_OF_OPTIONS
 from nerg_mi.progress import TerminalReporter
 from nerg_mi.ranges import KAPPAS, RANGE
 
-from .declarations import COMMANDS, Command, HelpView, Parameter
+from .declarations import Command, HelpView, Parameter
 from .ending import shorten_values
 from .signatures import make_command
-from .table import ROWS, TABLE
-
-PACKAGES = ("nerg_mi.cli",)
-"""Packages whose modules and submodules may declare commands."""
+from .table import ROWS, TABLE, Row
 
 GROUPS = {
     "rays": "Import tracking files as gaze rays, and check, filter, split and plot them.",
@@ -45,32 +39,13 @@ _ORDER = (
     "demo doctor scene view render draw rays poses align train eval report import export refine compile bake "
     "stats jobs worker study"
 ).split()
-_LINES = re.compile(r"``nerg ([a-z -]+)``: (.*?)(?=\n``nerg |\Z)", re.S)
 
 
-@dataclass(frozen=True)
-class ListedCommand:
-    """A command in the list of commands: its help line, and the module that declares it."""
-
-    line: str
-    module: str
-
-
-def find_commands() -> dict[str, ListedCommand]:
-    """Return all commands by name, in the order of the list. Imports no module."""
-    commands = {row.name: ListedCommand(row.line, row.function.partition(":")[0]) for row in TABLE}
-    for package in PACKAGES:
-        for folder in map(Path, importlib.import_module(package).__path__):
-            for path in sorted(folder.rglob("*.py")):
-                with open(path, encoding="utf-8") as file:
-                    head = file.read(2000)
-                if not head.startswith('"""``nerg '):
-                    continue
-                module = ".".join((package, *path.relative_to(folder).with_suffix("").parts))
-                for name, line in _LINES.findall(re.split(r"\n\s*\n|\"\"\"", head[3:])[0]):
-                    commands[name] = ListedCommand(" ".join(line.split()), module)
+def find_commands() -> dict[str, Row]:
+    """Return all commands by name, in the order of the list."""
     place = {name: k for k, name in enumerate(_ORDER)}
-    return dict(sorted(commands.items(), key=lambda item: place.get(item[0].split()[0], len(place))))
+    rows = sorted(TABLE, key=lambda row: place.get(row.name.split()[0], len(place)))
+    return {row.name: row for row in rows}
 
 
 # The base class of errors about the command line, which typer does not export.
@@ -106,7 +81,7 @@ def _global_options(
 
 def _group(
     prefix: str,
-    entries: Mapping[str, ListedCommand],
+    entries: Mapping[str, Row],
     callback: Callable[..., None] = lambda: None,
     arguments: Sequence[str] = (),
     **settings: Any,
@@ -143,7 +118,7 @@ def _group(
     return app
 
 
-def _about_group(name: str, entries: Mapping[str, ListedCommand]) -> str:
+def _about_group(name: str, entries: Mapping[str, Row]) -> str:
     """Return the help line of the group ``name``; groups that are not in `GROUPS` list their commands."""
     below = [other.removeprefix(f"{name} ") for other in entries if other.startswith(f"{name} ")]
     return GROUPS.get(name) or f"Commands: {', '.join(below)}."
@@ -153,24 +128,12 @@ def _listed() -> None:
     """A placeholder for a command in the list; a command that is called is built."""
 
 
-def _build(name: str, entries: Mapping[str, ListedCommand]) -> Any:
+def _build(name: str, entries: Mapping[str, Row]) -> Any:
     """Return the parser of the command ``name``, or of the group of commands that start with it."""
-    below = {other: entry for other, entry in entries.items() if other.startswith(f"{name} ")}
-    if name in ROWS:
-        return build_command(make_command(ROWS[name]), ROWS[name].line)
     if name in entries:
-        entry = entries[name]
-        if name not in COMMANDS:
-            importlib.import_module(entry.module)
-        if name in COMMANDS:
-            return build_command(COMMANDS[name], entry.line)
-        # Commands without their own line in a module docstring, such as figures.
-        below = {
-            c.name: ListedCommand(c.help, entry.module) for c in COMMANDS.values() if c.name.startswith(f"{name} ")
-        } | below
-        if not below:
-            raise LookupError(f'{entry.module} lists the command "{name}" and does not declare it')
-    help = entries[name].line if name in entries else _about_group(name, below)
+        return build_command(make_command(entries[name]), entries[name].line)
+    below = {other: entry for other, entry in entries.items() if other.startswith(f"{name} ")}
+    help = _about_group(name, below)
     return typer.main.get_command(_group(f"{name} ", below, name=name, help=help, add_completion=False))
 
 
@@ -314,11 +277,10 @@ def _make_spelling(parameters: Mapping[str, inspect.Parameter], without: Sequenc
 
 def choose_spelling(arguments: Sequence[str]) -> Spelling:
     """Return the spelling of parameters in messages of the command that ``arguments`` call."""
-    for name in (*COMMANDS, *ROWS):
+    for name, row in ROWS.items():
         words = name.split()
         if words == list(arguments[: len(words)]):
-            command = COMMANDS[name] if name in COMMANDS else make_command(ROWS[name])
-            return make_callback(command).__dict__["spelling"]
+            return make_callback(make_command(row)).__dict__["spelling"]
     return _make_spelling({})
 
 

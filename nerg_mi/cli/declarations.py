@@ -6,7 +6,7 @@ import importlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from nerg_mi.options import OUTPUT, PANEL
 from nerg_mi.threads import set_thread_count
@@ -33,9 +33,7 @@ def select_backend(mode: str | None, threads: int | None = None, *, allow_scalar
 
 # ---- Commands ----
 #
-# A command is a row of `nerg_mi.cli.table`. One that no function of the library serves is declared where it is defined:
-# the docstring of its module starts with its line, as in "``nerg doctor``: Check the installation", by which it is
-# found without importing the module.
+# A command is a row of `nerg_mi.cli.table`.
 
 
 @dataclass(frozen=True)
@@ -84,7 +82,7 @@ class HelpView:
 
 @dataclass(frozen=True)
 class Command:
-    """A command as declared by `command`."""
+    """A command, as `nerg_mi.cli.signatures.make_command` makes it of a row."""
 
     name: str
     run: Callable[..., Any]
@@ -94,53 +92,6 @@ class Command:
     without: tuple[str, ...]
     parameters: Mapping[str, Parameter]
     view: Callable[[Sequence[str]], HelpView] | None = None
-
-
-COMMANDS: dict[str, Command] = {}
-"""Commands of all imported modules, by name."""
-
-Run = TypeVar("Run", bound=Callable[..., Any])
-
-
-def command(
-    name: str,
-    help: str = "",
-    /,
-    *,
-    more: str = "",
-    options: type | None = None,
-    without: tuple[str, ...] = (),
-    view: Callable[[Sequence[str]], HelpView] | None = None,
-    **parameters: Parameter,
-) -> Callable[[Run], Run]:
-    """Declare the decorated function as what ``nerg NAME`` runs. The function is not changed.
-
-    The function is called with keyword arguments: the values of ``parameters``, ``options`` if there are any, and
-    ``reporter``.
-
-    Parameters
-    ----------
-    name
-        Words of the command, as "train gaze".
-    help
-        Summary for ``--help``, if it differs from the line in the module docstring.
-    more
-        Further paragraphs for ``--help``.
-    options
-        Dataclass whose fields become options (`nerg_mi.options.option`).
-    without
-        Fields that are not exposed on the command line.
-    view
-        Returns what ``--help`` shows with the arguments of the command line. Default: everything.
-    parameters
-        Arguments and options. The names are those of fields of ``options`` or of parameters of the function.
-    """
-
-    def decorate(run: Run) -> Run:
-        COMMANDS[name] = Command(name, run, help, more, options, without, parameters, view)
-        return run
-
-    return decorate
 
 
 def import_function(function: str) -> Callable[..., Any]:

@@ -17,6 +17,8 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast, get_type_hints
 
+import typer
+
 from nerg_mi.errors import NergError, parameter
 from nerg_mi.options import (
     OUTPUT,
@@ -132,6 +134,8 @@ def make_command(row: Row) -> Command:
         if row.prints:
             for part in result if isinstance(result, list) else [result]:
                 reporter.message(part.to_text())
+        if row.fails_unless and not getattr(result, row.fails_unless):
+            raise typer.Exit(1)
         if row.several:
             written = [cast("Any", result).save(path) for path in written]
         elif paths:

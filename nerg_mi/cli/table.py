@@ -29,7 +29,7 @@ class Row:
     of these parameters and fields, which only developers and experts set, in Python. A command that
     ``prints`` its result, a list of reports (their method ``to_text``), needs no output. A command with ``presets`` has
     the options of all readers of tracking files (`.presets`). The result of a command that ``waits`` serves until
-    Ctrl-C (its method ``wait``).
+    Ctrl-C (its method ``wait``). The exit code is 1 if an attribute of the result, ``fails_unless``, is false.
     """
 
     name: str
@@ -53,6 +53,7 @@ class Row:
     prints: bool = False
     presets: bool = False
     waits: bool = False
+    fails_unless: str = ""
 
 
 _RAYS_OUTPUT = "Rays file (.npz or .parquet) or dataset (.rays) to write."
@@ -510,6 +511,14 @@ TABLE = (
         groups={INPUT: ("up", "areas", "align"), OUTPUT: ("host", "port"), PERFORMANCE: ("compile",)},
         waits=True,
         without=("spp", "width", "hostnames", "observer"),
+    ),
+    Row(
+        "doctor",
+        "nerg_mi.diagnosis:run_diagnosis",
+        "Check the installation and suggest fixes.",
+        computes=False,
+        prints=True,
+        fails_unless="is_usable",
     ),
     Row(
         "jobs",

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import importlib
-from dataclasses import replace
 from typing import NamedTuple
 
 import pytest
 
 from nerg_mi.cli import main
-from nerg_mi.cli.building import find_commands
-from nerg_mi.cli.declarations import COMMANDS
 from tests.cli.outputs import list_trainings, make_inputs
 
 
@@ -33,20 +29,6 @@ def nerg(capsys):
         return Ended(end.value.code or 0, *capsys.readouterr())
 
     return run
-
-
-@pytest.fixture
-def handed(monkeypatch):
-    """``handed(name)``: the keywords, except the reporter, of each call of a workflow, which does not run."""
-
-    def keep(name: str) -> list[dict]:
-        importlib.import_module(find_commands()[name].module)
-        calls: list[dict] = []
-        run = lambda *, reporter, **values: calls.append(values)
-        monkeypatch.setitem(COMMANDS, name, replace(COMMANDS[name], run=run))
-        return calls
-
-    return keep
 
 
 @pytest.fixture(scope="session")

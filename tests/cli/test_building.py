@@ -6,7 +6,6 @@ import ast
 import inspect
 import math
 import re
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
@@ -19,7 +18,7 @@ from typer.testing import CliRunner
 import nerg_mi.cli
 from nerg_mi.cli import building
 from nerg_mi.cli.building import DEBUG, GROUPS, find_commands, make_callback
-from nerg_mi.cli.declarations import COMMANDS, Command, argument, extra
+from nerg_mi.cli.declarations import Command, argument, extra
 from nerg_mi.cli.signatures import read_parameter_texts, read_signature
 from nerg_mi.cli.table import ROWS, Row
 from nerg_mi.errors import NergError
@@ -95,58 +94,6 @@ def test_a_parse_error_names_the_parameter(serve):
     assert serve("mug", "--from", "1,2.5")[1][1].origin == (1.0, 2.5)
     done, _ = serve("mug", "--from", "east")
     assert done.exception.parameters == {"origin": ""}
-
-
-GREETING = '''"""``nerg greet kindly``: Say something kind.
-
-Greetings, for a test.
-"""
-
-from __future__ import annotations
-
-from dataclasses import dataclass, replace
-
-from nerg_mi.cli.declarations import argument, command
-from nerg_mi.options import option
-from nerg_mi.ranges import Range, ValidatedDataclass
-
-
-@dataclass(frozen=True, kw_only=True)
-class GreetingOptions(ValidatedDataclass):
-    times: int = option(1, "How often.", within=Range(1, 9))
-
-
-@command("greet kindly", more="It costs nothing.", options=GreetingOptions, name=argument("Of a person.", str))
-def greet(name, options, reporter):
-    for _ in range(options.times):
-        reporter.message(f"hello {name}")
-'''
-
-
-def test_a_command_is_one_module(monkeypatch, tmp_path, capsys):
-    """The command is listed, has a help text and runs as soon as its file exists."""
-
-    def nerg(*line):
-        with pytest.raises(SystemExit) as end:
-            nerg_mi.cli.main(list(line))
-        said = capsys.readouterr()
-        return end.value.code, said.out + said.err
-
-    (tmp_path / "kindness").mkdir()
-    (tmp_path / "kindness" / "greeting.py").write_text(GREETING)
-    monkeypatch.setattr(nerg_mi.cli, "__path__", [*nerg_mi.cli.__path__, str(tmp_path)])
-    try:
-        assert nerg("--help")[1].split()[-3:] == ["greet", "Commands:", "kindly."]
-        assert "kindly  Say something kind." in nerg("greet", "--help")[1]
-        assert "nerg_mi.cli.kindness.greeting" not in sys.modules
-        code, said = nerg("greet", "kindly", "--help")
-        assert code == 0 and "Say something kind.\n\n  It costs nothing." in said and "How often." in said
-        assert nerg("greet", "kindly", "Ada", "--times", "2") == (0, "hello Ada\nhello Ada\n")
-        assert nerg("greet", "kindly", "Ada", "--times", "10")[0] == 2
-    finally:
-        for name in ("nerg_mi.cli.kindness.greeting", "nerg_mi.cli.kindness"):
-            sys.modules.pop(name, None)
-        COMMANDS.pop("greet kindly", None)
 
 
 @dataclass(frozen=True)
@@ -314,15 +261,6 @@ def test_a_docstring_refers_to_the_texts_of_another_function():
     mesh, points = (read_parameter_texts(read_signature(f"{module}:export_{name}")) for name in ("mesh", "points"))
     assert set(points) - set(mesh) == {"max_points"} and "grid cells" in points["resolution"]
     assert {name: points[name] for name in set(points) & set(mesh)} == {k: v for k, v in mesh.items() if k in points}
-
-
-def test_a_command_line_without_a_command_is_refused(monkeypatch, tmp_path, capsys):
-    (tmp_path / "nothing.py").write_text('"""``nerg nothing``: Do nothing."""\n')
-    monkeypatch.setattr(nerg_mi.cli, "__path__", [*nerg_mi.cli.__path__, str(tmp_path)])
-    with pytest.raises(SystemExit) as end:
-        nerg_mi.cli.main(["nothing"])
-    sys.modules.pop("nerg_mi.cli.nothing")
-    assert end.value.code == 70 and "nerg_mi.cli.nothing lists the command" in capsys.readouterr().err
 
 
 def show_help(*line):

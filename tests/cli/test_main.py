@@ -5,15 +5,12 @@ import re
 import shutil
 import subprocess
 import sys
-from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
 
 import pytest
 
 from nerg_mi import diagnosis, llvm
 from nerg_mi.cli.building import GROUPS, find_commands
-from nerg_mi.cli.declarations import COMMANDS
 from nerg_mi.errors import MissingFile, NergError, UnusableLLVM, blame_options, format_error, translate_mitsuba_errors
 from tests.conftest import ROOT
 from tools.command_pages import iter_commands
@@ -43,19 +40,15 @@ def test02_help_imports_nothing_heavy():
     done = in_a_process("--help", after="print('loaded:', *sys.modules)")
     loaded = set(done.stdout.partition("loaded:")[2].split())
     assert "nerg_mi.cli" in loaded and not HEAVY & loaded
-    assert not {entry.module for entry in find_commands().values()} & loaded
+    assert not {row.function.partition(":")[0] for row in find_commands().values()} & loaded
 
 
 def test03_no_help_of_a_command_imports_anything_heavy():
     """The exception is import, which has the options of the readers of tables."""
     code = (
-        "import importlib, sys\nfrom nerg_mi.cli import building\n"
-        "for name, entry in building.find_commands().items():\n"
-        "    if name == 'rays import': continue\n"
-        "    if name in building.ROWS: building.build_command(building.make_command(building.ROWS[name]))\n"
-        "    else: importlib.import_module(entry.module)\n"
-        "for name, command in building.COMMANDS.items():\n"
-        "    if name != 'view': building.build_command(command)\n"
+        "import sys\nfrom nerg_mi.cli import building\n"
+        "for name, row in building.ROWS.items():\n"
+        "    if name != 'rays import': building.build_command(building.make_command(row))\n"
         f"print(*{HEAVY} & set(sys.modules))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
@@ -84,11 +77,10 @@ def test05_mode_is_the_variant_of_commands_that_compute():
 
 
 def failing(monkeypatch, error):
-    def command(reporter):
+    def fail(progress):
         raise error
 
-    import_module("nerg_mi.cli.machine")  # this package declares it
-    monkeypatch.setitem(COMMANDS, "doctor", replace(COMMANDS["doctor"], run=command))
+    monkeypatch.setattr(diagnosis, "run_diagnosis", fail)
 
 
 @pytest.mark.parametrize(
@@ -121,7 +113,7 @@ def test06_traceback_on_request(monkeypatch, nerg, error, code, ask):
         monkeypatch.setenv(ask, "1")
     ended = nerg("doctor", *([ask] if ask.startswith("--") else []))
     said = ended.err
-    assert ended.code == code and "Traceback (most recent call last)" in said and "in command" in said
+    assert ended.code == code and "Traceback (most recent call last)" in said and "in fail" in said
     assert said.strip().splitlines()[-1].startswith("nerg: ")
 
 
@@ -154,9 +146,10 @@ def test07_an_internal_error_is_reported_as_one(monkeypatch, nerg, error, said):
 def test07b_a_closed_output_stream_is_ignored(lines):
     """No error in the middle of the output, nor at its end, which is written when the interpreter stops."""
     code = (
-        "import sys, dataclasses\nimport nerg_mi.cli.machine\nfrom nerg_mi.cli.declarations import COMMANDS\n"
-        f"def run(reporter):\n    for i in range({lines}): print('a line of output')\n"
-        "COMMANDS['doctor'] = dataclasses.replace(COMMANDS['doctor'], run=run)\n"
+        "import sys\nfrom nerg_mi import diagnosis\n"
+        f"def run(progress):\n    for i in range({lines}): print('a line of output')\n"
+        "    return diagnosis.Diagnosis([diagnosis.Finding('all', 'well')], True)\n"
+        "diagnosis.run_diagnosis = run\n"
         "from nerg_mi.cli import main\nsys.argv[1:] = ['doctor']\nmain()"
     )
     process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)

@@ -3,7 +3,6 @@ full disk nor Ctrl-C loses anything."""
 
 from __future__ import annotations
 
-import importlib
 import os
 import pkgutil
 import resource
@@ -16,8 +15,7 @@ from typing import get_args, get_type_hints
 import pytest
 
 import nerg_mi.cli
-from nerg_mi.cli.building import find_commands, make_callback
-from nerg_mi.cli.declarations import COMMANDS
+from nerg_mi.cli.building import make_callback
 from nerg_mi.cli.signatures import make_command
 from nerg_mi.cli.table import ROWS
 
@@ -193,9 +191,7 @@ def test_filtering_in_place_on_a_full_disk_keeps_the_input(inputs, tmp_path, cap
 
 def commands() -> dict:
     """The function of each command of `nerg`, by its full name."""
-    for entry in find_commands().values():
-        importlib.import_module(entry.module)
-    made = COMMANDS | {name: make_command(row) for name, row in ROWS.items()}
+    made = {name: make_command(row) for name, row in ROWS.items()}
     return {name: (make_callback(command), command.parameters) for name, command in made.items()}
 
 
