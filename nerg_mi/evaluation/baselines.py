@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from types import ModuleType
 from typing import Any, NamedTuple
 
+import drjit as dr
 import numpy as np
 
-from nerg_mi.fields.kde import Backend, SphericalKde
+from nerg_mi.fields.gaze_hits import MAX_HITS, HitKernel, ReaimedHits, place_missing_points
+from nerg_mi.fields.kde import Backend, SphericalKde, get_default_backend
+from nerg_mi.fields.mlp import namespace
+from nerg_mi.maths.arrays import to_vector
 from nerg_mi.maths.sphere import aim
 from nerg_mi.maths.vmf import log_normaliser
 from nerg_mi.tracking.folds import iter_folds, sample_participants_equally
 from nerg_mi.tracking.probes import compute_participant_weights
 from nerg_mi.tracking.rays import Rays
+from nerg_mi.train.gaze_folds import HIT_KERNELS
 from nerg_mi.train.prior import select_prior_kappa
+from nerg_mi.train.stacking import fit_weights
 
 # Each baseline is a function ``(positions (P, 3), directions) -> (P, D)`` that returns densities in 1/sr, which
 # integrate to one; ``directions`` is (D, 3) for all positions or (P, D, 3).
@@ -22,17 +29,19 @@ from nerg_mi.train.prior import select_prior_kappa
 # A comparison is only fair if a baseline is tuned as carefully as the field. Number of neighbours, kernels and the
 # weight of the position-independent prior are therefore those with the highest log density of held-out rays, over folds
 # of the training rays that hold out what the test holds out: participants, positions, or both. The prior is that of a
-# gaze field (`train.prior.select_prior_kappa`).
+# gaze field (`train.prior.select_prior_kappa`). The stack is what can be had without a network: a mixture of the prior,
+# and of rays and re-aimed hits with kernels of all widths, whose weights are fitted to the same held-out rays.
 
 Baseline = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Densities (P, D), 1/sr, of positions (P, 3) in directions (D, 3) or (P, D, 3)."""
 
 UNIFORM, PRIOR, NEAREST_RAYS = "uniform", "position-independent prior", "nearest rays"
 CONDITIONAL_KDE, REAIMED_HITS = "conditional kernel density", "re-aimed hits"
+CONDITIONAL_HITS, STACK = "re-aimed hits, weighted by distance", "stack"
 """Names of the baselines."""
 
 UNIFORM_DENSITY = 1.0 / (4.0 * np.pi)  # 1/sr
-KAPPAS = (10.0, 20.0, 50.0, 100.0, 200.0, 400.0)  # Candidate concentrations of the kernels of neighbours
+KAPPAS = (10.0, 20.0, 50.0, 100.0, 200.0, 400.0, 800.0)  # Candidate concentrations of the kernels of neighbours
 COUNTS = (16, 64, 256, 1024, 4096)  # Candidate numbers of neighbours
 BANDWIDTHS = (0.1, 0.2, 0.4, 0.8, 1.6)  # Candidate standard deviations (m) of kernels over positions
 PRIOR_WEIGHTS = (0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 0.9, 1.0)  # Candidate weights of the prior in a mixture
@@ -40,8 +49,11 @@ DEFAULT_SETTINGS: Mapping[str, Mapping[str, float]] = {
     NEAREST_RAYS: {"rays": 1024.0, "kappa": 20.0, "prior weight": 0.2},
     CONDITIONAL_KDE: {"rays": 4096.0, "bandwidth": 0.4, "kappa": 20.0, "prior weight": 0.2},
     REAIMED_HITS: {"rays": 1024.0, "kappa": 50.0, "prior weight": 0.2},
+    CONDITIONAL_HITS: {"bandwidth": 0.4, "kappa": 120.0, "prior weight": 0.3},
 }
 """Settings of the baselines where there are too few rays to tune them."""
+# Of the stack: pseudo-rays of the prior, and of all kernels together, and the minimum weight of a kernel
+_PRIOR_PSEUDO_RAYS, _KERNEL_PSEUDO_RAYS, _MIN_KERNEL_WEIGHT = 5.0, 10.0, 0.01
 _FOLDS = 4  # Folds of the training rays
 _MAX_TEST_RAYS = 400  # Held-out rays of a fold
 MIN_AIM_DISTANCE = 0.15  # Metres below which the direction to a hit point is not used: the recorded one is
@@ -195,6 +207,48 @@ def _weigh(distance: np.ndarray, bandwidth: float) -> np.ndarray:
     return np.exp(0.5 * (distance[:, :1] ** 2 - distance**2) / bandwidth**2)
 
 
+class KernelMixture:
+    """Mixture of the prior and of kernels of training rays, with Gaussian weights of the distance to the position.
+
+    Parameters
+    ----------
+    prior : Baseline
+        Position-independent prior, whose weight is that left by ``parts``.
+    parts : sequence of ReaimedHits
+        Kernels of re-aimed hits and of rays, in metres.
+    """
+
+    def __init__(self, prior: Baseline, parts: Sequence[ReaimedHits]):
+        self._prior, self._parts = prior, parts
+        self._prior_weight = max(0.0, 1 - sum(part.weight for part in parts))
+
+    def __call__(self, positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Evaluate the densities (P, D) of positions (P, 3) in unit directions (D, 3) or (P, D, 3)."""
+        positions, directions = np.atleast_2d(np.asarray(positions, np.float64)), np.asarray(directions)
+        density = self._prior_weight * np.asarray(self._prior(positions, directions))
+        for start in range(0, len(positions), _BLOCK):
+            rows = slice(start, start + _BLOCK)
+            d = directions if directions.ndim == 2 else directions[rows]
+            for part in self._parts:
+                density[rows] += part.weight * part.observe(positions[rows], _get_backend()).evaluate(d)
+        return density
+
+
+def _get_backend() -> ModuleType:
+    return namespace(get_default_backend())
+
+
+def _make_kernels(rays: Rays, is_aimed: bool, weights: Sequence[float]) -> ReaimedHits | None:
+    """Make the kernels `HIT_KERNELS` with positive ``weights`` of rays, or of hits if ``is_aimed``; None if there are
+    none."""
+    kernels = [HitKernel(weight, *kernel) for weight, kernel in zip(weights, HIT_KERNELS) if weight > 0]
+    if not kernels:
+        return None
+    # A point far away has the recorded direction from all positions.
+    points, width = rays.hit if is_aimed else None, max(kernel.bandwidth for kernel in kernels)
+    return ReaimedHits(rays.origin, place_missing_points(rays.origin, rays.direction, points, width), kernels)
+
+
 # ---- Tuning ----
 
 
@@ -235,8 +289,8 @@ def make_tuned_baselines(
     Returns
     -------
     dict of str to TunedBaseline
-        The uniform density, the position-independent prior, the nearest rays, the conditional kernel density and, with
-        ``hits``, the re-aimed hits.
+        The uniform density, the position-independent prior, the nearest rays, the conditional kernel density, with
+        ``hits`` the re-aimed hits (nearest, and weighted by distance), and the stack.
 
     Notes
     -----
@@ -248,16 +302,22 @@ def make_tuned_baselines(
         rays = replace(rays, hit=np.asarray(hits, np.float64))
     if prior_kappa is None:
         prior_kappa = select_prior_kappa(rays, "person", seed)
+    aims = (False, True) if REAIMED_HITS in kinds else (False,)
     scores: dict[str, list[np.ndarray]] = {name: [] for name in kinds}
+    columns: list[np.ndarray] = []
+    participant: list[np.ndarray] = []
     settings: dict[str, list[dict[str, float]]] = {}
     make_prior = lambda rays: make_prior_baseline(rays, kappa=prior_kappa, weights=compute_participant_weights(rays))
     for k, fold in enumerate(iter_folds(rays, radius, _FOLDS, seed, participants=participants, positions=positions)):
-        test = sample_participants_equally(fold.held_out, _MAX_TEST_RAYS, seed + k)
+        # At recorded and at new positions alike: settings for the few positions far from all others do worse elsewhere.
+        test = fold.sample(_MAX_TEST_RAYS, seed + k)
         prior_densities = make_prior(fold.train)(np.zeros((1, 3)), test.direction)[0]
         for name, (is_conditional, is_aimed) in kinds.items():
             scored = _score_neighbours(fold.train, test, prior_densities, is_conditional, is_aimed)
             scores[name].append(_average_participants(scored.log_density, test))
             settings[name] = scored.settings
+        columns.append(np.column_stack([prior_densities, *_evaluate_kernels(fold.train, test, aims)]))
+        participant.append(test.person + k * len(rays.persons))
     prior = make_prior(rays)
     tuned = {
         UNIFORM: TunedBaseline(make_uniform_baseline()),
@@ -270,7 +330,75 @@ def make_tuned_baselines(
             best = settings[name][int(np.concatenate(scores[name], axis=1).mean(axis=1).argmax())]
         neighbours = NearestRays(rays, rays.hit if is_aimed else None)
         tuned[name] = TunedBaseline(_make_neighbour_density(neighbours, prior, best), best, folds)
+    sample = sample_participants_equally(rays, MAX_HITS, 0)
+    make_mixture = lambda weights: KernelMixture(
+        prior,
+        [
+            part
+            for aimed, of_kind in zip(aims, weights[1:].reshape(len(aims), -1))
+            if (part := _make_kernels(sample, aimed, of_kind)) is not None
+        ],
+    )
+    densities = np.concatenate(columns) if columns else None
+    units = np.concatenate(participant) if columns else None
+    if len(aims) > 1:
+        best, weights = _tune_single_kernel(densities, units)
+        tuned[CONDITIONAL_HITS] = TunedBaseline(make_mixture(weights), best, len(columns))
+    weights = _fit_stack(densities, units, len(aims))
+    shown = {"prior weight": round(float(weights[0]), 2), "kernels": float(np.count_nonzero(weights[1:]))}
+    tuned[STACK] = TunedBaseline(make_mixture(weights), shown, len(columns))
     return tuned
+
+
+def _evaluate_kernels(train: Rays, test: Rays, aims: Sequence[bool]) -> list[np.ndarray]:
+    """Evaluate `HIT_KERNELS` of the rays ``train``, and of their hits, at the rays ``test`` (n, K)."""
+    sample, ns = sample_participants_equally(train, MAX_HITS, 0), _get_backend()
+    out = []
+    for is_aimed in aims:
+        part = _make_kernels(sample, is_aimed, [1 / len(HIT_KERNELS)] * len(HIT_KERNELS))
+        assert part is not None
+        directions, index = to_vector(ns.Array3f, test.direction), dr.arange(ns.UInt32, len(test))
+        out.append(part.observe(test.origin, ns).evaluate_kernels(directions, index))
+    return out
+
+
+def _tune_single_kernel(
+    densities: np.ndarray | None, participant: np.ndarray | None
+) -> tuple[Mapping[str, float], np.ndarray]:
+    """Return the settings of the kernel of re-aimed hits that is best with the prior, and the weights of the columns of
+    ``densities``: of the prior, of rays and of re-aimed hits."""
+    best, size = DEFAULT_SETTINGS[CONDITIONAL_HITS], len(HIT_KERNELS)
+    if densities is not None and participant is not None:
+        prior, aimed = densities[:, :1], densities[:, 1 + size :]
+        candidates = []
+        for weight in PRIOR_WEIGHTS:
+            log = np.log(np.maximum((1 - weight) * aimed + weight * prior, _MIN_DENSITY))
+            means = np.mean([log[participant == p].mean(axis=0) for p in np.unique(participant)], axis=0)
+            candidates.append((means.max(), weight, int(means.argmax())))
+        _, weight, k = max(candidates)
+        best = dict(zip(("bandwidth", "kappa"), HIT_KERNELS[k])) | {"prior weight": weight}
+    weights = np.zeros(1 + 2 * size)
+    weights[0] = best["prior weight"]
+    weights[1 + size + HIT_KERNELS.index((best["bandwidth"], best["kappa"]))] = 1 - weights[0]
+    return best, weights
+
+
+def _fit_stack(densities: np.ndarray | None, participant: np.ndarray | None, kinds: int) -> np.ndarray:
+    """Fit the weights of the columns of ``densities``: of the prior, and of the kernels of each of the ``kinds``."""
+    default, size = DEFAULT_SETTINGS[CONDITIONAL_HITS], kinds * len(HIT_KERNELS)
+    weights = np.zeros(1 + size)
+    if densities is None or participant is None:
+        kernel = HIT_KERNELS.index((default["bandwidth"], default["kappa"]))
+        weights[[0, 1 + size - len(HIT_KERNELS) + kernel]] = default["prior weight"], 1 - default["prior weight"]
+        return weights
+    log, index = np.log(np.maximum(densities, _MIN_DENSITY)).T, np.arange(1 + size)
+    for _ in range(2):
+        pseudo_rays = np.array([_PRIOR_PSEUDO_RAYS, *[_KERNEL_PSEUDO_RAYS / size] * (len(index) - 1)])
+        fitted = fit_weights(log[index], participant, pseudo_rays)
+        weights[:] = 0
+        weights[index] = fitted
+        index = np.flatnonzero((weights >= _MIN_KERNEL_WEIGHT) | (np.arange(1 + size) == 0))
+    return weights
 
 
 def format_settings(baselines: Mapping[str, TunedBaseline]) -> str:

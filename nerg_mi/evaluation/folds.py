@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
@@ -35,6 +35,7 @@ from nerg_mi.train.gaze_settings import GazeSettings, ProbeSettings
 from .gaze import SCORES, SPLITS, format_score_table
 from .gaze_report import explain_missing, format_table, format_uncertainty
 from .held_out import PRINTED, evaluate_gaze
+from .position_scores import format_verdicts
 from .uncertainty import average_folds, correlate_uncertainty, summarise_folds
 
 FIELD, SCORED = "gaze.safetensors", "scores.json"
@@ -68,9 +69,11 @@ class FoldResult(ResultTables):
         One row per split and method: means over folds.
     held_out
         What each fold holds out, in words.
+    verdicts
+        Bits where training participants stood and where none did, one row per fold, kind of positions and method.
     """
 
-    TABLES = ("rows", "each", "by_position", "uncertainty", "calibration")
+    TABLES = ("rows", "each", "by_position", "uncertainty", "calibration", "verdicts")
 
     rows: list[dict[str, Any]]
     each: list[dict[str, Any]]
@@ -80,6 +83,7 @@ class FoldResult(ResultTables):
     uncertainty: list[dict[str, Any]]
     calibration: list[dict[str, Any]]
     held_out: str
+    verdicts: list[dict[str, Any]] = field(default_factory=list)
 
     def save(self, folder: FilePath) -> list[Path]:
         """Write folds.md, folds.csv (by fold), positions.csv (by position) and folds.json to ``folder``, and return
@@ -102,6 +106,7 @@ class FoldResult(ResultTables):
         write_csv(files[1], self.each)
         write_csv(files[2], self.by_position)
         tables = {"methods": self.rows, "uncertainty": self.uncertainty, "calibration": self.calibration}
+        tables["verdicts"] = self.verdicts
         write_json(files[3], {"folds": folds, "seed": self.each[0]["fold"], **tables})
         return files
 
@@ -368,6 +373,7 @@ def _score_fold(common: FoldInputs, gaze: GazeField, rays: Rays | Path, seed: in
         )
         tables[split] = {"rows": scored.rows, "positions": scored.positions, "people": scored.people}
         tables[split] |= {"by_position": scored.by_position, "calibration": scored.calibration}
+        tables[split]["verdicts"] = scored.verdicts
     return tables
 
 
@@ -396,7 +402,7 @@ def _summarise(
 ) -> FoldResult:
     """Return the result of the folds: their seeds, fields, and tables by split."""
     by_split, regions = {split: [] for split in splits}, {split: [] for split in splits}
-    each, fields, positions = [], [], []
+    each, fields, positions, verdicts = [], [], [], []
     for seed, gaze, results in finished:
         fields.append(gaze)
         for split in splits:
@@ -408,6 +414,10 @@ def _summarise(
                 {"fold": seed, "split": split, **row, **group_key(row)} for row in results[split]["by_position"]
             ]
             regions[split].append(results[split]["calibration"])
+        # They are those of the held-out participants in every split that has them.
+        verdicts += [{"fold": seed, **row} for row in results[splits[0]]["verdicts"]]
+        for line in format_verdicts(results[splits[0]]["verdicts"]):
+            reporter.message(f"fold {seed}, {line}")
         score = by_split[splits[0]][-1][0]
         reporter.message(f"fold {seed}, {splits[0]}: KLD {score['KLD']:.3f}, CC {score['CC']:.3f}")
     rows = [{"split": split, **row} for split, scores in by_split.items() for row in summarise_folds(scores)]
@@ -416,6 +426,6 @@ def _summarise(
         populations["anywhere"] = positions
     ranks = [{"split": split, **row} for split, scores in populations.items() for row in correlate_uncertainty(scores)]
     held = [{"split": split, **row} for split, scores in regions.items() for row in average_folds(scores, _LEVELS)]
-    for table in (rows, each, positions, ranks, held):
+    for table in (rows, each, positions, ranks, held, verdicts):
         add_notes(table, explain_missing)
-    return FoldResult(rows, each, fields, [], positions, ranks, held, held_out)
+    return FoldResult(rows, each, fields, [], positions, ranks, held, held_out, verdicts)

@@ -16,16 +16,17 @@ from nerg_mi.files.atomic import write_text
 from nerg_mi.files.safe_read import is_count, read_json
 from nerg_mi.files.tables import format_markdown_table, write_csv, write_json
 from nerg_mi.maths.sphere import Z_UP, latlong_grid
+from nerg_mi.tracking.folds import NEW_POSITION_DISTANCE
 from nerg_mi.tracking.probes import REGION_LEVELS, format_level
 
-from .baselines import CONDITIONAL_KDE, NEAREST_RAYS, PRIOR, REAIMED_HITS, UNIFORM, Baseline
+from .baselines import CONDITIONAL_HITS, CONDITIONAL_KDE, NEAREST_RAYS, PRIOR, REAIMED_HITS, STACK, UNIFORM, Baseline
 from .gaze import MAP_SCORES, SCORES, SPLIT_HALF, GazeTest, find_split_half_fault
 from .uncertainty import RETAINED_FRACTIONS
 
 # ---- Reports of an evaluation: tables as Markdown, CSV and JSON, and pictures of reference and prediction ----
 
 _DIGITS = {"MAE": 4}  # Digits of scores, if not three
-_TEXT_COLUMNS = ("method", "person", "signal", "error", "component")  # Columns of text
+_TEXT_COLUMNS = ("method", "kind", "person", "signal", "error", "component")  # Columns of text
 _HEADINGS = {"person": "participant", "rays": "samples"}  # Headings that differ from the keys of rows
 
 
@@ -60,6 +61,7 @@ def write_report(
     positions: list[dict] | None = None,
     ranks: list[dict] | None = None,
     regions: list[dict] | None = None,
+    verdicts: list[dict] | None = None,
 ) -> list[Path]:
     """Write ``gaze.md``, ``gaze.csv``, ``persons.csv``, ``gaze.json`` and ``positions.csv`` into ``folder``; returns
     the paths.
@@ -76,6 +78,8 @@ def write_report(
         Introduction of the Markdown file.
     positions, ranks, regions : list of dict, optional
         Rows of `uncertainty`.
+    verdicts : list of dict, optional
+        Rows of `position_scores`.
     """
     positions, ranks, regions = positions or [], ranks or [], regions or []
     files = [folder / name for name in ("gaze.md", "gaze.csv", "persons.csv", "gaze.json", "positions.csv")]
@@ -85,13 +89,28 @@ def write_report(
     participant_table = format_table(
         participants, ("method", "person", "rays", "bits", "KLD", "CC", "NSS", "AUC", "loglik")
     )
-    text = f"{notes}\n\n{format_table(rows)}\n{format_table(differences)}\n{format_uncertainty(ranks, regions)}"
+    text = f"{notes}\n\n{format_table(rows)}\n{format_table(differences)}\n{format_verdict_table(verdicts or [])}"
+    text += format_uncertainty(ranks, regions)
     write_text(files[0], f"{text}## Per participant\n\n{participant_table}")
     for path, table in zip((*files[1:3], files[4]), (rows, participants, positions)):
         write_csv(path, table)
     results = {"methods": rows, "persons": participants, "uncertainty": ranks, "calibration": regions}
-    write_json(files[3], {**metadata, **results})
+    write_json(files[3], {**metadata, **results, "verdicts": verdicts or []})
     return files
+
+
+def format_verdict_table(rows: list[dict]) -> str:
+    """Format the scores at recorded positions and away from them as Markdown, the best baselines first."""
+    if not rows:
+        return ""
+    return (
+        "## Recorded and new positions\n\nHeld-out participants up to, and farther than, "
+        f"{NEW_POSITION_DISTANCE:g} m from every training position: bits per ray above the position-independent prior "
+        "at the origin of each ray, averaged over the rays of each participant, and by how much the gaze field exceeds "
+        "each baseline, which is tuned on participants, for new positions also on zones, that are left out. Brackets: "
+        "95 % intervals of Student's t over participants."
+        f"\n\n{format_table(rows, ('kind', 'method', 'people', 'rays', 'bits', 'bits.gap'))}\n"
+    )
 
 
 def format_uncertainty(ranks: list[dict], regions: list[dict]) -> str:
@@ -325,6 +344,8 @@ _BASELINE_NAMES = {
     NEAREST_RAYS: "the nearest rays",
     CONDITIONAL_KDE: f"the {CONDITIONAL_KDE}",
     REAIMED_HITS: f"the {REAIMED_HITS}",
+    CONDITIONAL_HITS: f"the {CONDITIONAL_HITS}",
+    STACK: "the stack of kernels",
 }
 _OLD_METHODS = {"position-blind": PRIOR, "4,096 nearest rays": NEAREST_RAYS}  # In files of earlier versions
 

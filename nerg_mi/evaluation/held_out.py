@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -22,6 +23,7 @@ from nerg_mi.files.values import FilePath, to_path
 from nerg_mi.progress import Progress, Reporter, open_reporter
 from nerg_mi.ranges import DIRECTIONS, KAPPAS, SEEDS, Range, check_ranges
 from nerg_mi.tracking.dataset import hash_rays, open_rays
+from nerg_mi.tracking.filters import purge, split_by_person
 from nerg_mi.tracking.rays import TRACKING, Rays
 from nerg_mi.tracking_kinds import read_tracking
 from nerg_mi.train.gaze import check_environment
@@ -29,17 +31,18 @@ from nerg_mi.train.gaze_data import find_hit_points
 from nerg_mi.train.prior import ELEVATION_PRIOR
 
 from . import gaze as evaluation
-from .baselines import CONDITIONAL_KDE, NEAREST_RAYS, REAIMED_HITS, Baseline, format_settings, make_tuned_baselines
+from .baselines import NEAREST_RAYS, REAIMED_HITS, STACK, Baseline, TunedBaseline, format_settings, make_tuned_baselines
 from .baselines import PRIOR as PRIOR_BASELINE
 from .gaze import EPS, SCORES, SPLIT_HALF, CachedBaseline, FieldDensity
 from .gaze_report import draw_comparison, explain_missing, write_report
+from .position_scores import AWAY, RECORDED, format_verdicts, score_kinds
 from .uncertainty import correlate_uncertainty, measure_calibration, score_positions
 
 _FIELD = "gaze field"  # Name of the method that is compared with the baselines
 # Methods that are scored for each participant, those that are drawn, and those whose highest-density regions are
 # calibrated; re-aimed hits only with surfaces.
 _BY_PERSON = (_FIELD, NEAREST_RAYS, REAIMED_HITS)
-_DRAWN = (_FIELD, PRIOR_BASELINE, NEAREST_RAYS, CONDITIONAL_KDE, REAIMED_HITS)
+_DRAWN = (_FIELD, PRIOR_BASELINE, NEAREST_RAYS, REAIMED_HITS, STACK)
 _CALIBRATED = (_FIELD, PRIOR_BASELINE, NEAREST_RAYS)
 # Scores in the terminal; the files have all of them.
 PRINTED = tuple(score for score in SCORES if score not in ("SIM", "MAE", "loglik"))
@@ -49,7 +52,7 @@ PRINTED = tuple(score for score in SCORES if score not in ("SIM", "MAE", "loglik
 class GazeEvaluation(ResultTables):
     """Scores of a gaze field."""
 
-    TABLES = ("rows", "persons", "by_position", "uncertainty", "calibration")
+    TABLES = ("rows", "persons", "by_position", "uncertainty", "calibration", "verdicts")
 
     # One row per method, the gaze field first; scores of `gaze.SCORES`, confidence limits with ".low" and ".high".
     rows: list[dict]
@@ -77,6 +80,8 @@ class GazeEvaluation(ResultTables):
     introduction: str = ""  # What the scores are, in Markdown
     # Writes the figure of reference and predicted densities; None without one.
     draw: Callable[[Path], None] | None = field(default=None, compare=False)
+    # Bits of the field and of baselines where training participants stood, and where none did (`score_kinds`).
+    verdicts: list[dict[str, Any]] = field(default_factory=list)
 
     def save(self, folder: FilePath) -> list[Path]:
         """Write tables and figures to ``folder``, and return their paths.
@@ -98,7 +103,7 @@ class GazeEvaluation(ResultTables):
             "split_half_note": self.split_half_note,
         }
         tables = self.by_position, self.uncertainty, self.calibration
-        files = write_report(folder, self.rows, self.persons, summary, self.introduction, *tables)
+        files = write_report(folder, self.rows, self.persons, summary, self.introduction, *tables, self.verdicts)
         if self.draw is not None:
             self.draw(folder / "positions.png")
             files.append(folder / "positions.png")
@@ -123,7 +128,7 @@ def evaluate_gaze(
     progress: Progress = None,
 ) -> GazeEvaluation:
     """Score a gaze field on held-out data and compare it with baselines: uniform, position-independent, nearest rays,
-    conditional kernel density, re-aimed hits, and the other half of the participants.
+    conditional kernel density, re-aimed hits, a stack of kernels, and the other half of the participants.
 
     The held-out data chose nothing of the field, and the baselines are tuned on folds of the training rays. An
     alignment that nerg align fitted to hit points or traces of gaze used the rays of all participants, and the defaults
@@ -201,15 +206,9 @@ def evaluate_gaze(
         # A field that was trained with ``force`` is scored, with a warning.
         check_environment(opened, scored, True, reporter)
         reporter.progress(0.02, "baselines")
-        baselines = make_tuned_baselines(
-            train,
-            account["radius"],
-            find_hit_points(train, opened),
-            participants=split != "pos",
-            positions=split != "people",
-            prior_kappa=prior_kappa,
-            seed=seed,
-        )
+        hits = find_hit_points(train, opened)
+        tune = partial(make_tuned_baselines, train, account["radius"], hits, prior_kappa=prior_kappa, seed=seed)
+        baselines = tune(participants=split != "pos", positions=split != "people")
         depth, count = training.get("probes", {}).get("depth", "median"), len(test.centres)
         # Most of the time is spent on evaluating the field.
         report_position = lambda number: reporter.progress(
@@ -231,7 +230,10 @@ def evaluate_gaze(
         rows += [half] if half else []
         if half_note:
             reporter.message(f"the split half is not shown: {half_note}")
-        reporter.progress(0.86, "participants")
+        reporter.progress(0.85, "recorded and new positions")
+        density = FieldDensity(loaded.network, opened.medium, opened.align, depth)
+        verdicts = _score_kinds(data, train, account, split, density, baselines, tune, seed)
+        reporter.progress(0.88, "participants")
         select = lambda names: {name: methods[name] for name in names if name in methods}
         persons = evaluation.score_participants(test, select(_BY_PERSON), prior, min_rays)
         reporter.progress(0.9, "uncertainty")
@@ -241,7 +243,7 @@ def evaluate_gaze(
         calibrated = {k: (m(test.centres, test.directions), at(m)) for k, m in select(_CALIBRATED).items()}
         stored = training.get("mix", {}).get("regions")
         regions = measure_calibration(test, calibrated, resamples, seed, {_FIELD: stored} if stored else None)
-        for table in (rows, persons, places, ranks, regions):
+        for table in (rows, persons, places, ranks, regions, verdicts):
             add_notes(table, explain_missing)
         numbers = len(train), len(data), account["radius"], kappa, directions, resamples
         notes = _notes(loaded.name, split, test, *numbers, half_note)
@@ -269,6 +271,7 @@ def evaluate_gaze(
             resamples,
             f"{notes} Tracking: {TRACKING[tracking]}. {format_settings(baselines)}",
             draw if pictures else None,
+            verdicts,
         )
         if folder is not None:
             reporter.progress(0.95, "pictures")
@@ -277,12 +280,41 @@ def evaluate_gaze(
     return result
 
 
+def _score_kinds(
+    rays: Rays,
+    train: Rays,
+    account: dict,
+    split: str,
+    density: Baseline,
+    baselines: Mapping[str, TunedBaseline],
+    tune: Callable[..., Mapping[str, TunedBaseline]],
+    seed: int,
+) -> list[dict[str, Any]]:
+    """Score the field at recorded positions and away from them, on all rays of the held-out participants, or, if none
+    were held out, on rays of the training participants at the held-out positions. The ``baselines`` are those tuned
+    for the ``split``, and ``tune`` makes others."""
+    if account.get("people"):
+        held_out = rays.select(split_by_person(rays, test_persons=account["people"])[1])
+    else:
+        held_out = rays.select(~purge(rays, np.array(account["centres"]), account["radius"]))
+    tuned_for = {"people": RECORDED, "both": AWAY}.get(split)
+
+    def tune_for(kind: str) -> dict[str, Baseline]:
+        if kind == tuned_for or not account.get("people"):
+            return {name: baseline.density for name, baseline in baselines.items()}
+        return {name: b.density for name, b in tune(participants=True, positions=kind == AWAY).items()}
+
+    return score_kinds(train, held_out, density, tune_for, seed)
+
+
 def _report(gaze: GazeField, result: GazeEvaluation, reporter: Reporter) -> None:
     """Report the scores as a table, and the written files."""
     rows = [{k: row[k] for k in ("method", *PRINTED, "integral")} for row in result.rows]
     what = tracking_suffix({"tracking": result.tracking})
     title = f"{gaze.name}{what}, {result.split}: {result.positions} positions, {result.people} participants"
     reporter.message(evaluation.format_score_table(rows, title))
+    for line in format_verdicts(result.verdicts):
+        reporter.message(line)
     for path in result.files:
         reporter.message(f"wrote {path}")
 

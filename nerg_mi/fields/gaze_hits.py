@@ -1,12 +1,14 @@
-"""Re-aimed hits: the part of a gaze field that is a kernel density of training samples.
+"""Re-aimed hits: the part of a gaze field that is a mixture of kernel densities of training samples.
 
-q(r_o | p_o) = Σ_j w_j f(r_o; a_j, κ) / Σ_j w_j,  w_j = exp(-|o_j - p_o|² / 2b²),  a_j = (h_j - p_o) / |h_j - p_o|
+q(r_o | p_o) = Σ_k v_k q_k(r_o | p_o) / Σ_k v_k
+q_k(r_o | p_o) = Σ_j w_j f(r_o; a_j, κ_k) / Σ_j w_j,  w_j = exp(-|o_j - p_o|² / 2b_k²),  a_j = (h_j - p_o) / |h_j - p_o|
 
 Sample j was recorded at o_j and hit a surface at h_j. Seen from the observer p_o, it points in the direction a_j, so
 that the kernels f (von Mises-Fisher, concentration κ) follow the parallax of the surfaces. Without the re-aiming it is
 the conditional kernel density of Rosenblatt (1969). It resolves what attracts attention as finely as the samples do,
 but says little where nobody stood nearby, where the networks of a gaze field still generalise. A gaze field
-mixes both.
+mixes both, with kernels of several bandwidths b and concentrations κ, whose weights v are fitted
+(`nerg_mi.train.stacking`).
 """
 
 from __future__ import annotations
@@ -20,14 +22,19 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.maths.sphere import aim
-from nerg_mi.maths.types import Float, Point3f, Vector3f
+from nerg_mi.maths.types import Float, Point3f, UInt32, Vector3f
 from nerg_mi.maths.vmf import log_normaliser
 from nerg_mi.ranges import KAPPAS, LENGTHS, MAX_COORDINATE
 
 from .kde import SphericalKde, SphericalKdeTable
 
 MAX_HITS = 1 << 15  # Maximum number of samples that a field stores, 24 bytes each
-MAX_NEIGHBOURS = 1024  # Maximum number of samples that an observer's density is the sum of: the nearest
+MAX_KERNELS = 64  # Maximum number of kernels
+# Maximum number of samples that an observer's density is the sum of. They are the nearest ones: of all samples for a
+# small bandwidth, and of a random subset if more are within _NEIGHBOURHOOD bandwidths.
+MAX_NEIGHBOURS = 1024
+_NEIGHBOURHOOD = 2.5  # Bandwidths
+_NUM_THINNING_CENTRES = 256  # Samples at which neighbours are counted
 FAR = 1e4  # Maximum distance, in bandwidths, at which the point of a sample without a hit is placed
 # Distance from the observer, in bandwidths, below which the direction to a point is that of the recording: the gaze on
 # a nearby point says nothing about observers next to it.
@@ -36,11 +43,12 @@ _TABLE_SPACING = 0.2  # Texels of a table in units of 1/sqrt(κ): errors below 3
 _MIN_TABLE_LANES = 8192  # Number of directions below which a table is not considered
 
 
-class NearestOrigins(NamedTuple):
-    """The k samples with the origins nearest to each of P positions, nearest first."""
+class HitKernel(NamedTuple):
+    """One of the kernel densities that re-aimed hits mix."""
 
-    distance: np.ndarray  # Distance of the origin (P, k)
-    index: np.ndarray  # Index of the sample (P, k)
+    weight: float  # Weight of its density in the gaze field
+    bandwidth: float  # Standard deviation of the weights over the distance between observers, in the field's units
+    kappa: float  # Concentration of the kernels
 
 
 class HitNeighbours(NamedTuple):
@@ -61,22 +69,18 @@ class ReaimedHits:
         Positions of the observers of the samples, in the field's frame and units.
     points : array (n, 3)
         Hit points; `place_missing_points` replaces missing ones.
-    weight : float
-        Weight of the density in the mixture.
-    bandwidth : float
-        Standard deviation b of the weights over the distance between observers, in the field's units.
-    kappa : float
-        Concentration of the kernels.
+    kernels : sequence of HitKernel
+        Kernel densities, whose weights sum to at most one.
 
     Raises
     ------
     ValueError
-        For arrays that do not match or are not finite, and for parameters out of range.
+        For arrays that do not match or are not finite, and for kernels out of range.
     """
 
-    def __init__(self, origins: np.ndarray, points: np.ndarray, weight: float, bandwidth: float, kappa: float):
+    def __init__(self, origins: np.ndarray, points: np.ndarray, kernels: Sequence[HitKernel]):
         self.origins, self.points = (np.ascontiguousarray(a, np.float32).reshape(-1, 3) for a in (origins, points))
-        self.weight, self.bandwidth, self.kappa = float(weight), float(bandwidth), float(kappa)
+        self.kernels = tuple(HitKernel(*map(float, kernel)) for kernel in kernels)
         if not 0 < len(self.origins) == len(self.points) <= MAX_HITS:
             raise ValueError(
                 f"re-aimed hits need one point for each of 1 to {MAX_HITS} origins, got {len(self.points)} and "
@@ -84,11 +88,22 @@ class ReaimedHits:
             )
         if not all(np.abs(a).max() <= MAX_COORDINATE for a in (self.origins, self.points)):
             raise ValueError(f"re-aimed hits need finite coordinates up to {MAX_COORDINATE:g}")
-        if not 0 <= self.weight <= 1 or self.bandwidth not in LENGTHS or self.kappa not in KAPPAS:
+        if not 0 < len(self.kernels) <= MAX_KERNELS or not self.weight <= 1 + 1e-6:
             raise ValueError(
-                "re-aimed hits need a weight from 0 to 1, a positive bandwidth and a positive concentration, got "
-                f"{weight}, {bandwidth} and {kappa}"
+                f"re-aimed hits need 1 to {MAX_KERNELS} kernels whose weights sum to at most 1, got "
+                f"{len(self.kernels)} and {self.weight:g}"
             )
+        for weight, bandwidth, kappa in self.kernels:
+            if not 0 < weight <= 1 + 1e-6 or bandwidth not in LENGTHS or kappa not in KAPPAS:
+                raise ValueError(
+                    "re-aimed hits need a weight from 0 to 1, a positive bandwidth and a positive concentration, got "
+                    f"{weight}, {bandwidth} and {kappa}"
+                )
+
+    @property
+    def weight(self) -> float:
+        """Weight of the density in the gaze field, the sum of the weights of the kernels."""
+        return sum(kernel.weight for kernel in self.kernels)
 
     @cached_property
     def _tree(self) -> Any:
@@ -97,29 +112,53 @@ class ReaimedHits:
         return KDTree(self.origins.astype(np.float64))
 
     @cached_property
+    def _thinned(self) -> dict[int, tuple[np.ndarray, Any]]:
+        # Indices of the samples of each level of thinning, and their tree
+        return {0: (np.arange(len(self.origins)), self._tree)}
+
+    def _thin(self, bandwidth: float) -> int:
+        """Return the level of thinning at which `MAX_NEIGHBOURS` samples cover the neighbourhood of ``bandwidth``."""
+        centres = self.origins[:: -(-len(self.origins) // _NUM_THINNING_CENTRES)].astype(np.float64)
+        counts = self._tree.query_ball_point(centres, _NEIGHBOURHOOD * bandwidth, return_length=True)
+        level = max(0, int(np.ceil(np.log2(np.median(counts) / MAX_NEIGHBOURS))))
+        if level not in self._thinned:
+            from scipy.spatial import KDTree
+
+            subset = np.random.default_rng(level).permutation(len(self.origins))[: len(self.origins) >> level]
+            self._thinned[level] = subset, KDTree(self.origins[subset].astype(np.float64))
+        return level
+
+    @cached_property
+    def _levels(self) -> dict[float, int]:
+        """Level of thinning of each bandwidth."""
+        return {bandwidth: self._thin(bandwidth) for bandwidth in {kernel.bandwidth for kernel in self.kernels}}
+
+    @cached_property
     def _recorded_directions(self) -> np.ndarray:
         # A point at the observer who looked at it has no direction.
         return aim(self.points.astype(np.float64), np.zeros(3), self.origins.astype(np.float64), 0.0)
 
-    def find_nearest(self, positions: np.ndarray) -> NearestOrigins:
-        """Find the samples nearest to each of ``positions`` (P, 3), in the field's frame."""
-        positions = np.atleast_2d(np.asarray(positions, np.float64))
-        k = min(MAX_NEIGHBOURS, len(self.origins))
-        return NearestOrigins(*self._tree.query(positions, k=np.arange(1, k + 1)))
-
-    def find(self, positions: np.ndarray, nearest: NearestOrigins | None = None) -> HitNeighbours:
+    def find(self, positions: np.ndarray) -> list[HitNeighbours]:
         """Find the samples nearest to each of ``positions`` (P, 3), in the field's frame, with their weights and
-        directions.
+        directions, for each of the kernels."""
+        positions = np.asarray(positions, np.float64).reshape(-1, 3)
+        nearest: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        neighbours: dict[float, HitNeighbours] = {}
+        for bandwidth, level in self._levels.items():
+            if level not in nearest:
+                subset, tree = self._thinned[level]
+                distance, index = tree.query(positions, k=np.arange(1, min(MAX_NEIGHBOURS, len(subset)) + 1))
+                nearest[level] = distance, subset[index]
+            neighbours[bandwidth] = self._weigh(positions, *nearest[level], bandwidth)
+        return [neighbours[kernel.bandwidth] for kernel in self.kernels]
 
-        ``nearest``: what `find_nearest` returns for these positions, of any hits with these origins.
-        """
-        positions = np.atleast_2d(np.asarray(positions, np.float64))
-        distance, index = nearest or self.find_nearest(positions)
+    def _weigh(self, positions: np.ndarray, distance: np.ndarray, index: np.ndarray, bandwidth: float) -> HitNeighbours:
+        """Weigh and aim the samples ``index`` (P, k) at ``distance`` (P, k) from ``positions`` (P, 3)."""
         # Relative to the nearest sample, so that the weights do not vanish far from all samples.
-        weights = np.exp(0.5 * (distance[:, :1] ** 2 - distance**2) / self.bandwidth**2)
+        weights = np.exp(0.5 * (distance[:, :1] ** 2 - distance**2) / bandwidth**2)
         origins, points = self.origins[index].astype(np.float64), self.points[index].astype(np.float64)
         recorded = self._recorded_directions[index]
-        min_distance = _MIN_DISTANCE * self.bandwidth
+        min_distance = _MIN_DISTANCE * bandwidth
         directions = aim(points, recorded, positions[:, None], min_distance)
         weights = np.where(directions.any(axis=-1), weights, 0)
         # If no sample has a direction, there is nothing to aim at; the density must still be one.
@@ -129,24 +168,14 @@ class ReaimedHits:
         inverse = np.where(length > min_distance, 1 / np.maximum(length, min_distance), 0)
         return HitNeighbours(directions, weights, inverse, origins - positions[:, None])
 
-    def make_kde(self, neighbours: HitNeighbours, ns: ModuleType) -> SphericalKde:
-        """Make the densities of P positions, on the backend ``ns``, in the field's frame."""
-        count, size = neighbours.weights.shape
-        return SphericalKde(
-            neighbours.directions.reshape(-1, 3),
-            np.arange(count + 1) * size,
-            self.kappa,
-            neighbours.weights.ravel(),
-            ns,
-        )
-
     def mix(self, gaze: Float, density: Float) -> Float:
         """Mix the ``density`` of the hits into the ``gaze`` of the networks."""
         return (1 - self.weight) * gaze + self.weight * density
 
-    def observe(self, position: np.ndarray, ns: ModuleType) -> ObservedHits:
-        """Make the density of the observer at ``position`` (3,), in the field's frame."""
-        return ObservedHits(self, self.find(position), ns)
+    def observe(self, positions: np.ndarray, ns: ModuleType) -> ObservedHits:
+        """Make the density of the observers at ``positions``, (3,) or (P, 3) in the field's frame, on the backend
+        ``ns``."""
+        return ObservedHits(self.kernels, self.find(positions), ns)
 
 
 def place_missing_points(
@@ -176,28 +205,43 @@ def place_missing_points(
 class ObservedHits:
     """The density of re-aimed hits for one observer, or for several without a table."""
 
-    def __init__(self, hits: ReaimedHits, neighbours: HitNeighbours, ns: ModuleType):
-        self._kde = hits.make_kde(neighbours, ns)
-        self._table: SphericalKdeTable | None = None
-        self._hits, self._neighbours = hits, neighbours
+    def __init__(self, kernels: Sequence[HitKernel], neighbours: Sequence[HitNeighbours], ns: ModuleType):
+        self._kernels, self._neighbours, self._ns = kernels, neighbours, ns
+        self._kdes = [_make_kde(near, kernel.kappa, ns) for kernel, near in zip(kernels, neighbours)]
+        self._tables: list[SphericalKdeTable | None] = [None] * len(kernels)
+        total = sum(kernel.weight for kernel in kernels)
+        self._shares = [kernel.weight / total for kernel in kernels]
 
     @classmethod
     def merge(cls, observed: Sequence[ObservedHits]) -> ObservedHits:
         """The density for all observers of ``observed``, in their order."""
         first = observed[0]
-        neighbours = HitNeighbours(*(np.concatenate(arrays) for arrays in zip(*(o._neighbours for o in observed))))
-        return cls(first._hits, neighbours, first._kde.ns)
+        neighbours = [
+            HitNeighbours(*(np.concatenate(arrays) for arrays in zip(*of_kernel)))
+            for of_kernel in zip(*(o._neighbours for o in observed))
+        ]
+        return cls(first._kernels, neighbours, first._ns)
 
     @property
     def is_tabulated(self) -> bool:
-        return self._table is not None
+        return None not in self._tables
 
     def prepare(self, lanes: int) -> None:
-        """Tabulate the density of a single observer if that is faster for ``lanes`` directions."""
-        is_single = self._kde.count == 1
-        is_worthwhile = is_single and lanes >= _MIN_TABLE_LANES and SphericalKdeTable.is_worthwhile(self._kde, lanes)
-        if self._table is None and is_worthwhile:
-            self._table = SphericalKdeTable(self._kde, spacing=_TABLE_SPACING)
+        """Tabulate the kernels of a single observer for which that is faster for ``lanes`` directions."""
+        if lanes < _MIN_TABLE_LANES or self._kdes[0].count > 1:
+            return
+        for k, kde in enumerate(self._kdes):
+            if self._tables[k] is None and SphericalKdeTable.is_worthwhile(kde, lanes):
+                self._tables[k] = SphericalKdeTable(kde, spacing=_TABLE_SPACING)
+
+    def evaluate(self, directions: np.ndarray) -> np.ndarray:
+        """Densities (P, D) of all P observers in unit ``directions`` (D, 3), or (P, D, 3), float64."""
+        return self._add([kde.evaluate(directions).astype(np.float64) for kde in self._kdes])
+
+    def evaluate_kernels(self, r_o: Vector3f, observer: UInt32) -> np.ndarray:
+        """Densities (n, kernels) of each kernel in the directions ``r_o`` for the observers with the indices
+        ``observer``, one direction each."""
+        return np.stack([np.array(kde.density(observer, r_o), np.float64) for kde in self._kdes], axis=1)
 
     def density(self, r_o: Vector3f, p_o: Point3f, observer: Any = None) -> Float:
         """Density (1/sr) in unit directions ``r_o``, in the field's frame, for the observers with the indices
@@ -206,49 +250,70 @@ class ObservedHits:
         Differentiable in ``r_o`` and in the position ``p_o`` of the observer (one lane or one per direction), to first
         order and for constant neighbours.
         """
-        ns, lanes = self._kde.ns, dr.width(r_o)
+        ns, lanes = self._ns, dr.width(r_o)
         d = ns.Array3f(*(dr.detach(c) for c in (r_o.x, r_o.y, r_o.z)))
         observer = dr.zeros(ns.UInt32, lanes) if observer is None else ns.UInt32(observer)
         with dr.suspend_grad():
             # Within a recorded branch or loop nothing can be evaluated.
             if not dr.flag(dr.JitFlag.SymbolicScope):
                 self.prepare(lanes)
-            value = self._table.density(d) if self._table else self._kde.density(observer, d)
+            values = [
+                kde.density(observer, d) if table is None else table.density(d)
+                for kde, table in zip(self._kdes, self._tables)
+            ]
+            total = self._add(values)
         if not dr.grad_enabled(r_o, p_o):
-            return value
+            return total
         with dr.suspend_grad():
-            slope_r, slope_p = self._compute_slopes(d, value, observer)
+            slopes = [
+                _compute_slopes(ns, near, kernel, d, value, observer)
+                for kernel, near, value in zip(self._kernels, self._neighbours, values)
+            ]
+            slope_r, slope_p = (self._add(parts) for parts in zip(*slopes))
         moved = lambda v: type(v)(v - dr.detach(v))
         attach = lambda slope, v: slope.x * v.x + slope.y * v.y + slope.z * v.z
-        return value + attach(slope_r, moved(r_o)) + attach(slope_p, moved(p_o))
+        return total + attach(slope_r, moved(r_o)) + attach(slope_p, moved(p_o))
 
-    def _compute_slopes(self, d: Any, value: Any, observer: Any) -> tuple[Any, Any]:
-        """Derivatives of the density ``value`` in directions ``d`` with respect to ``d`` and to the position."""
-        ns, near, kappa = self._kde.ns, self._neighbours, self._hits.kappa
-        size = near.weights.shape[1]
-        offsets = near.offsets / self._hits.bandwidth**2
-        weights = near.weights / near.weights.sum(axis=1, keepdims=True)
-        packed = np.concatenate(
-            [near.directions, weights[..., None], offsets, near.inverse_distance[..., None]], axis=2
-        )
-        rows = ns.Float(packed.astype(np.float32).ravel())
-        peak = float(np.exp(log_normaliser(kappa)))
+    def _add(self, values: Sequence[Any]) -> Any:
+        total = self._shares[0] * values[0]
+        for share, value in zip(self._shares[1:], values[1:]):
+            total += share * value
+        return total
 
-        def body(i, by_r, by_p, d, value, first):
-            at = lambda k: dr.gather(ns.Float, rows, (first + i) * 8 + k)
-            aim, offset = ns.Array3f(at(0), at(1), at(2)), ns.Array3f(at(4), at(5), at(6))
-            weight, inverse = at(3), at(7)
-            kernel = peak * dr.exp(-0.5 * kappa * dr.squared_norm(d - aim))
-            slope = weight * kernel * kappa
-            by_p += weight * (kernel - value) * offset - slope * inverse * (d - dr.dot(d, aim) * aim)
-            return i + 1, by_r + slope * aim, by_p, d, value, first
 
-        zero = dr.zeros(ns.Array3f, dr.width(d))
-        _, by_r, by_p, *_ = dr.while_loop(
-            state=(dr.zeros(ns.UInt32, dr.width(d)), zero, ns.Array3f(zero), d, value, observer * size),
-            cond=lambda i, by_r, by_p, d, value, first: i < size,
-            body=body,
-            labels=("i", "by_r", "by_p", "d", "value", "first"),
-            label="slopes of re-aimed hits",
-        )
-        return by_r, by_p
+def _make_kde(neighbours: HitNeighbours, kappa: float, ns: ModuleType) -> SphericalKde:
+    """Make the densities of P positions, on the backend ``ns``, in the field's frame."""
+    count, size = neighbours.weights.shape
+    directions, offsets = neighbours.directions.reshape(-1, 3), np.arange(count + 1) * size
+    return SphericalKde(directions, offsets, kappa, neighbours.weights.ravel(), ns)
+
+
+def _compute_slopes(
+    ns: ModuleType, near: HitNeighbours, kernel: HitKernel, d: Any, value: Any, observer: Any
+) -> tuple[Any, Any]:
+    """Derivatives of the density ``value`` of a kernel with respect to the directions ``d`` and to the position."""
+    size, kappa = near.weights.shape[1], kernel.kappa
+    offsets = near.offsets / kernel.bandwidth**2
+    weights = near.weights / near.weights.sum(axis=1, keepdims=True)
+    packed = np.concatenate([near.directions, weights[..., None], offsets, near.inverse_distance[..., None]], axis=2)
+    rows = ns.Float(packed.astype(np.float32).ravel())
+    peak = float(np.exp(log_normaliser(kappa)))
+
+    def body(i, by_r, by_p, d, value, first):
+        at = lambda k: dr.gather(ns.Float, rows, (first + i) * 8 + k)
+        aim, offset = ns.Array3f(at(0), at(1), at(2)), ns.Array3f(at(4), at(5), at(6))
+        weight, inverse = at(3), at(7)
+        density = peak * dr.exp(-0.5 * kappa * dr.squared_norm(d - aim))
+        slope = weight * density * kappa
+        by_p += weight * (density - value) * offset - slope * inverse * (d - dr.dot(d, aim) * aim)
+        return i + 1, by_r + slope * aim, by_p, d, value, first
+
+    zero = dr.zeros(ns.Array3f, dr.width(d))
+    _, by_r, by_p, *_ = dr.while_loop(
+        state=(dr.zeros(ns.UInt32, dr.width(d)), zero, ns.Array3f(zero), d, value, observer * size),
+        cond=lambda i, by_r, by_p, d, value, first: i < size,
+        body=body,
+        labels=("i", "by_r", "by_p", "d", "value", "first"),
+        label="slopes of re-aimed hits",
+    )
+    return by_r, by_p

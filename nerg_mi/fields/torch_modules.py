@@ -359,9 +359,10 @@ def _evaluate_hits(field: GazeNetwork, p_o: torch.Tensor, r_o: torch.Tensor) -> 
     if field.hits is None:
         raise ValueError("this gaze field has no re-aimed hits")
     positions, observer = np.unique(p_o.detach().cpu().numpy(), axis=0, return_inverse=True)
-    kde = field.hits.make_kde(field.hits.find(positions), field.ns)
-    directions = to_vector(field.ns.Array3f, r_o.detach().cpu().numpy())
-    density = kde.density(field.ns.UInt32(observer.ravel().astype(np.uint32)), directions)
+    ns = field.ns
+    directions, origins = (to_vector(ns.Array3f, v.detach().cpu().numpy()) for v in (r_o, p_o))
+    observed = field.hits.observe(positions, ns)
+    density = observed.density(directions, origins, ns.UInt32(observer.ravel().astype(np.uint32)))
     return torch.as_tensor(np.array(density), device=p_o.device)
 
 

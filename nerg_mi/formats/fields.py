@@ -23,7 +23,7 @@ from nerg_mi.fields.gaze_base import (
     max_sizes_of,
     summarize_provenance,
 )
-from nerg_mi.fields.gaze_hits import ReaimedHits
+from nerg_mi.fields.gaze_hits import HitKernel, ReaimedHits
 from nerg_mi.fields.mlp import MLP
 from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid, RefinedGrid, unpack_bits
 from nerg_mi.fields.radiance import EMPTY, Background, BackgroundConfig, RadianceConfig, RadianceNetwork
@@ -377,9 +377,6 @@ def matches_checksum(path: str | Path, sha256: object) -> bool:
     )
 
 
-_HIT_PARAMETERS = ("weight", "bandwidth", "kappa")  # Numbers of `ReaimedHits` in the metadata
-
-
 def save_gaze(field: GazeNetwork, path: str | Path, provenance: dict, half: bool = False) -> None:
     """Write ``field`` with its support and its re-aimed hits, if any.
 
@@ -398,14 +395,20 @@ def save_gaze(field: GazeNetwork, path: str | Path, provenance: dict, half: bool
         tensors["support.cells"], metadata["support"] = field.support.cells, {"radius": field.support.radius}
     if field.hits is not None:
         tensors["hits.origins"], tensors["hits.points"] = field.hits.origins, field.hits.points
-        metadata["hits"] = {name: getattr(field.hits, name) for name in _HIT_PARAMETERS}
+        metadata["hits"] = {"kernels": [list(kernel) for kernel in field.hits.kernels]}
     write_checkpoint(path, "gaze", tensors, metadata)
 
 
-def _read_hits(arrays: StoredArrays, parameters: object) -> ReaimedHits:
+def _read_hits(arrays: StoredArrays, metadata: object) -> ReaimedHits:
     get = lambda name: arrays.get_array(f"hits.{name}", None, 3, max_value=MAX_COORDINATE)
-    values = {name: read_number(parameters, name, "re-aimed hits") for name in _HIT_PARAMETERS}
-    return ReaimedHits(get("origins"), get("points"), **values)
+    # Files of earlier versions have one kernel, whose numbers are entries of their own.
+    rows = metadata["kernels"] if isinstance(metadata, dict) and "kernels" in metadata else [metadata]
+    if not isinstance(rows, list):
+        raise ValueError('"kernels" of its re-aimed hits must be a list')
+    names = HitKernel._fields
+    parameters = [dict(zip(names, row, strict=True)) if isinstance(row, list) else row for row in rows]
+    kernels = [HitKernel(*(read_number(row, name, "re-aimed hits") for name in names)) for row in parameters]
+    return ReaimedHits(get("origins"), get("points"), kernels)
 
 
 def load_gaze(path: str | Path, ns: ModuleType) -> tuple[GazeNetwork, dict[str, Any]]:

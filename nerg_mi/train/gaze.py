@@ -48,6 +48,7 @@ from .gaze_run import StateSettings, fit_gaze
 from .gaze_trainer import GazeProgress
 from .prior import check_prior_kappa
 
+_MIN_TRAIN_FRACTION = 0.5  # Fraction of the rays that the fields of the folds should be trained on
 _DOMINANT_PRIOR = 0.5  # Weight from which the prior dominates the field
 WORDS = ("hits", "none")
 """Environments that are named by a word: the hit points of the rays, and no geometry."""
@@ -492,6 +493,11 @@ def _report_result(field: GazeField, reporter: Reporter) -> None:
                 f"position-independent prior, {m['bits']:+.3f} with {_describe_weights(m)}, which these samples chose"
                 + ("" if m["bits_crossed"] is None else f"; {m['bits_crossed']:+.3f} with weights from other folds")
             )
+            if m["train_fraction"] < _MIN_TRAIN_FRACTION:
+                reporter.warn(
+                    f"the fields of the folds were trained on only {100 * m['train_fraction']:.0f} % of the rays, so "
+                    "that they are worse than this one, whose weight is too small; record more participants"
+                )
             reporter.message(
                 f"regions with {100 * m['regions']['80%']:.0f} % of the field's gaze contain 80 % of the held-out gaze"
             )
@@ -513,9 +519,10 @@ def _report_result(field: GazeField, reporter: Reporter) -> None:
 def _describe_weights(selection: dict) -> str:
     """Describe the weights of a mixture that cross-validation has selected."""
     prior = f"a weight of {100 * selection['mix']:.0f} % of the prior"
-    if not selection["hits_weight"]:
+    if not selection["hits"]:
         return prior
-    return (
-        f"{prior} and {100 * selection['hits_weight']:.0f} % of the re-aimed hits of observers nearby "
-        f"(bandwidth {selection['hits_bandwidth']:g} m, kappa {selection['hits_kappa']:g})"
+    total = sum(weight for weight, *_ in selection["hits"])
+    kernels = ", ".join(
+        f"{100 * weight:.0f} % of {width:g} m and {kappa:g}" for weight, width, kappa in selection["hits"]
     )
+    return f"{prior} and {100 * total:.0f} % of the re-aimed hits (bandwidths and kappas: {kernels})"

@@ -14,13 +14,13 @@ import numpy as np
 from nerg_mi.environment.environment import Environment
 from nerg_mi.errors import NergError, parameter
 from nerg_mi.fields.gaze_base import GazeHead, GazeHeadConfig, interpolate_table
-from nerg_mi.fields.gaze_hits import MAX_HITS, NearestOrigins, ReaimedHits, place_missing_points
+from nerg_mi.fields.gaze_hits import MAX_HITS, HitKernel, ReaimedHits, place_missing_points
 from nerg_mi.interruption import Interruption
 from nerg_mi.maths.arrays import to_vector
 from nerg_mi.photos.salience import SalienceView
 from nerg_mi.ranges import KAPPAS, LENGTHS
 from nerg_mi.tracking.filters import purge, split_by_person, split_by_position
-from nerg_mi.tracking.folds import iter_folds, sample_participants_equally
+from nerg_mi.tracking.folds import Fold, iter_folds, sample_participants_equally
 from nerg_mi.tracking.probes import calibrate_levels, compute_region_levels
 from nerg_mi.tracking.rays import Rays
 
@@ -37,6 +37,7 @@ from .gaze_recipes import GazePlan
 from .gaze_settings import GazeSettings, ProbeSettings
 from .gaze_trainer import GazeProgress, GazeTrainer, ProgressCallback, scale_progress
 from .prior import make_prior_from_rays, select_prior_kappa
+from .stacking import fit_sparse_weights
 
 # ---- Splits ----
 #
@@ -196,42 +197,44 @@ def select_far_views(views: Sequence[SalienceView], points: np.ndarray, distance
 #
 # The kernels and the weight of the position-independent prior, so that a field is not worse than the prior alone.
 #
-# With few or stationary participants a field overfits and scores below the position-independent prior. The weight of
-# the prior is therefore the one whose mixture predicts held-out rays best (stacking; Wolpert 1992, Smyth and Wolpert
-# 1999): each fold holds out some participants at held-out positions and trains a field on the others with the same
-# number of steps. Densities are those at the rays' own origins, averaged over each participant's rays. Few held-out
-# participants say little about others, and a field that is better for them by chance is worse for the next. So the
-# weight of the best mean only counts where the field is clearly better than the prior: by _CLEAR_GAIN after a
-# deduction of standard errors over participants. Elsewhere the best mean after that deduction counts; it is zero for
-# the prior alone, so where nothing can be learned from position the weight is one. Without surfaces a field can only
-# interpolate between positions, and the deduction is larger. If the field needs no prior in the first folds, the
-# others are skipped. The held-out rays also calibrate the highest-density regions of the mixture.
+# With few or stationary participants a field overfits and scores below the position-independent prior, and where many
+# stood it resolves less than re-aimed hits (`fields.gaze_hits`). The gaze field is therefore a mixture of field, prior
+# and several kernels of re-aimed hits, whose weights predict held-out rays best (`stacking`): each fold holds out some
+# participants, and zones of positions, and trains a field on the other rays with the same number of steps. One half of
+# the held-out rays that are scored are at recorded positions, the other half at new ones. Densities are those at the
+# rays' own origins. A weight that depends on the distance to the nearest recorded positions predicted no better than a
+# constant one in two recorded places.
 #
-# Re-aimed hits (`fields.gaze_hits`) are mixed in, too: their kernels, bandwidth and weight are those with the best mean
-# over the same participants, if they improve it by _MIN_HITS_GAIN, which pays for their evaluation, and without
-# surfaces also by two standard errors. Otherwise their weight is zero, and nothing of them is stored.
+# Few held-out participants say little about others, and a mixture that is better for them by chance is worse for the
+# next. So the gain over the prior is that with weights of the other folds, averaged over each participant's rays, and
+# the mixture only counts as it is where it is clearly better than the prior: by _CLEAR_GAIN after a deduction of
+# standard errors over participants. Elsewhere the prior is added with the weight of the best gain after that
+# deduction; it is zero for the prior alone, so where nothing can be learned from position the weight is one. Without
+# surfaces a field can only interpolate between positions, and the deduction is larger. If the field needs no prior in
+# the first folds, and enough participants were held out for the weights of the hits, the others are skipped. The
+# held-out rays also calibrate the highest-density regions of the mixture.
 
 PRIOR_WEIGHTS = np.array([0.01, 0.02, *(0.05 * np.arange(1, 21))])
-"""Candidate weights of the prior. Zero is excluded, so that no density is zero."""
+"""Weights of the prior in a mixture with the field alone. Zero is excluded, so that no density is zero."""
 FOLD_TIME_FRACTION = 0.5  # Fraction of a training's time limit that the folds take
 # Maximum number of held-out rays of a fold, and directions over which the density at their origins is integrated
 _MAX_RAYS, _NUM_DIRECTIONS = 320, 1024
 _CLEAR_GAIN = 0.1  # Nats per ray
 # Standard errors over participants that are deducted from a gain, with and without surfaces
 _CAUTION, _CAUTION_WITHOUT_SURFACES = 1.0, 2.0
+_SHRINKAGES = 0.05 * np.arange(21)  # Candidate weights of the prior that is added to a mixture
 # Numbers of folds and of held-out participants after which a small weight is accepted, if the mean of each fold is best
 # with a weight up to _SMALL_WEIGHT and exceeds the prior by _CLEAR_GAIN
 _MIN_FOLDS, _MIN_PARTICIPANTS, _SMALL_WEIGHT = 2, 12, 0.1
 _SE_FACTOR = 0.5  # Standard errors by which the first variant may be worse than the best
 _MIN_DENSITY = 1e-9  # Minimum density (1/sr), so that its logarithm is finite
 
-HIT_WEIGHTS = np.array([0.0, 0.05, *(0.1 * np.arange(1, 10)), 0.95])
-"""Candidate weights of the re-aimed hits."""
-HIT_KERNELS = tuple((bandwidth, kappa) for bandwidth in (0.2, 0.4, 0.8, 1.6) for kappa in (50.0, 100.0, 200.0, 400.0))
+HIT_KERNELS = tuple(
+    (bandwidth, kappa)
+    for bandwidth in (0.1, 0.2, 0.4, 0.8, 1.6, 5.0)
+    for kappa in (10.0, 40.0, 120.0, 300.0, 800.0, 2000.0)
+)
 """Candidate bandwidths (metres) and concentrations of the re-aimed hits."""
-_MIN_HITS_GAIN = 0.02  # Nats per ray
-# Pairs of candidate weights: of the prior and of the re-aimed hits
-_WEIGHT_PAIRS = np.array([(m, h) for m in PRIOR_WEIGHTS for h in HIT_WEIGHTS if m + h <= 1 + 1e-9])
 
 
 _KEYS = {"prior_weight": "mix"}  # Fields with another name in checkpoints
@@ -257,31 +260,35 @@ class PriorSelection:
     # whose rays selected both.
     variant: str | None = None
     variants: dict[str, float] | None = None
-    # Weight, bandwidth (metres) and concentration of the re-aimed hits; a weight of zero: none.
-    hits_weight: float = 0.0
-    hits_bandwidth: float | None = None
-    hits_kappa: float | None = None
+    # Weights, bandwidths (metres) and concentrations of the re-aimed hits
+    hits: tuple[HitKernel, ...] = ()
+    # Mean fraction of the rays on which the field of a fold was trained
+    train_fraction: float | None = None
+
+    @property
+    def hits_weight(self) -> float:
+        return sum(kernel.weight for kernel in self.hits)
 
     def to_dict(self) -> dict:
         """Return the selection as JSON, for the provenance."""
-        return {_KEYS.get(k, k): _round_values(v) for k, v in asdict(self).items()}
+        entries = asdict(replace(self, hits=()))
+        entries["hits"] = [list(kernel) for kernel in self.hits]
+        return {_KEYS.get(k, k): _round_values(v) for k, v in entries.items()}
 
     @staticmethod
     def from_dict(data: dict[str, Any]) -> PriorSelection:
         """Restore a selection from `to_dict`. Raises ``TypeError`` or ``ValueError`` for invalid data."""
-        names: dict[str, str] = {key: name for name, key in _KEYS.items()}
-        selection = PriorSelection(**{names.get(k, k): v for k, v in dict(data).items()})
+        names, values = {key: name for name, key in _KEYS.items()}, dict(data)
+        values["hits"] = tuple(HitKernel(*map(float, row)) for row in values.get("hits", ()))
+        selection = PriorSelection(**{names.get(k, k): v for k, v in values.items()})
         if not 0 <= selection.prior_weight <= 1:
             raise ValueError(f'its "mix" must be from 0 to 1, got {selection.prior_weight}')
         if selection.prior_kappa is not None and selection.prior_kappa not in KAPPAS:
             raise ValueError(f'its "prior_kappa" must be positive, got {selection.prior_kappa}')
-        if not 0 <= selection.hits_weight <= 1 - selection.prior_weight + 1e-6:
-            raise ValueError(f'its "hits_weight" must be from 0 to 1, got {selection.hits_weight}')
-        bandwidth, kappa = selection.hits_bandwidth, selection.hits_kappa
-        if selection.hits_weight and (
-            bandwidth is None or kappa is None or bandwidth not in LENGTHS or kappa not in KAPPAS
-        ):
-            raise ValueError('its "hits_bandwidth" and "hits_kappa" must be positive')
+        if not 0 <= selection.hits_weight <= 1 - selection.prior_weight + 1e-3:
+            raise ValueError(f'the weights of its "hits" must sum to at most 1, got {selection.hits_weight:g}')
+        if any(k.weight <= 0 or k.bandwidth not in LENGTHS or k.kappa not in KAPPAS for k in selection.hits):
+            raise ValueError('the weights, bandwidths and concentrations of its "hits" must be positive')
         return selection
 
     def apply_prior(self, field: GazeHead, rays: Rays | None, geometry: Environment, plan: GazePlan) -> None:
@@ -297,11 +304,11 @@ class PriorSelection:
 
     def make_hits(self, rays: Rays | None, geometry: Environment, plan: GazePlan) -> ReaimedHits | None:
         """Make the re-aimed hits of ``rays`` for the field; None if their weight is zero."""
-        if not self.hits_weight or rays is None or self.hits_bandwidth is None or self.hits_kappa is None:
+        if not self.hits or rays is None:
             return None
         rays = sample_participants_equally(rays, MAX_HITS, plan.settings.seed + 5)
         rays = replace(rays, hit=find_hit_points(rays, geometry, plan.probes.depth))
-        return _make_hits(rays, geometry, self.hits_bandwidth, self.hits_kappa, self.hits_weight)
+        return _make_hits(rays, geometry, self.hits)
 
 
 def selects_prior_weight(plan: GazePlan) -> bool:
@@ -313,24 +320,14 @@ class FoldDensities(NamedTuple):
     """Densities (1/sr) of a fold at n held-out rays, each at its own origin."""
 
     person: np.ndarray  # Participant of each ray (n,)
-    field: np.ndarray  # Of the field in the direction of each ray (n,)
-    prior: np.ndarray  # Of the prior (n,)
+    # In the direction of each ray: of the field, of the prior, and of the re-aimed hits with each of `HIT_KERNELS`, if
+    # they are used (n, 2 or 2 + K)
+    densities: np.ndarray
     field_maps: np.ndarray  # Of the field in D directions of equal area (n, D)
     prior_maps: np.ndarray  # Of the prior (n, D)
-    # Of the re-aimed hits (n, C) with each of `HIT_KERNELS`; C is 0 if they are not used.
-    hits: np.ndarray
-    # Maps (n, D) of the re-aimed hits with one of `HIT_KERNELS`
-    make_hit_maps: Callable[[int], np.ndarray]
-
-
-class _Mixture(NamedTuple):
-    """Weights of the prior and of the re-aimed hits, the index of their kernel in `HIT_KERNELS`, and the gain (N,) over
-    the prior for each held-out participant."""
-
-    prior_weight: float
-    hits_weight: float
-    kernel: int | None
-    gains: np.ndarray
+    # Maps (n, D) of the density of re-aimed hits with these kernels
+    make_hit_maps: Callable[[Sequence[HitKernel]], np.ndarray]
+    train_fraction: float = 1.0  # Fraction of the rays on which the field was trained
 
 
 @dataclass(frozen=True)
@@ -341,78 +338,76 @@ class FoldResults:
     kappa: float | None  # Concentration of the prior's kernels; None if it was not selected
     folds: list[FoldDensities]
     caution: float = _CAUTION  # Standard errors over participants that are deducted from a gain
-    hits_caution: float = 0.0  # Standard errors by which the re-aimed hits must improve the mixture
 
     def select(self) -> PriorSelection:
         """Select the weights of the prior and of the re-aimed hits; the default weight if there are no folds."""
         if not self.folds:
             return PriorSelection(self.default_weight, 0)
-        plain = self.compute_gains()
-        pairs = _WEIGHT_PAIRS[:, 0], _WEIGHT_PAIRS[:, 1]
-        with_hits = [self.compute_gains(*pairs, k) for k in range(self.folds[0].hits.shape[1])]
-        best = self._select_mixture(plain, with_hits, np.ones(len(plain), bool))
+        densities = np.concatenate([fold.densities for fold in self.folds])
+        fold = np.repeat(np.arange(len(self.folds)), [len(fold.person) for fold in self.folds])
+        participant = np.concatenate([fold.person for fold in self.folds])
+        # Each participant of each fold; participants of several folds are others in each.
+        unit = np.unique(np.stack([fold, participant]), axis=1, return_inverse=True)[1].ravel()
+        log = _log(densities).T
+        weights = fit_sparse_weights(log, unit)
+        groups = fold if len(self.folds) > 1 else unit
+        is_crossed = len(np.unique(groups)) > 1
+        gains = np.empty((unit.max() + 1, len(_SHRINKAGES)))
+        for k in np.unique(groups):
+            others = groups != k if is_crossed else np.ones(len(groups), bool)
+            candidates = _shrink(fit_sparse_weights(log[:, others], unit[others]), _SHRINKAGES)
+            of_group = np.unique(unit[groups == k])
+            gains[of_group] = _compute_gains(densities, unit, candidates)[of_group]
+        index = _select_weight(gains, self.caution)
+        # Rounded as stored, so that a resumed training has the same weights
+        weights = _shrink(weights, _SHRINKAGES[[index]]).round(4)
+        weights[0, 0] = 1 - weights[0, 1:].sum()
+        alone = np.zeros((1, len(log)))
+        alone[0, :2] = 1 - PRIOR_WEIGHTS[0], PRIOR_WEIGHTS[0]
         to_bits = lambda nats: float(nats.mean() / np.log(2))
+        _, prior_weight, *hit_weights = weights[0].tolist()
         selection = PriorSelection(
-            best.prior_weight, len(self.folds), self.kappa, to_bits(best.gains), to_bits(plain[:, 0])
+            prior_weight,
+            len(self.folds),
+            self.kappa,
+            to_bits(_compute_gains(densities, unit, weights)),
+            to_bits(_compute_gains(densities, unit, alone)),
+            to_bits(gains[:, index]) if is_crossed else None,
+            hits=tuple(HitKernel(v, *kernel) for v, kernel in zip(hit_weights, HIT_KERNELS) if v),
+            train_fraction=float(np.mean([fold.train_fraction for fold in self.folds])),
         )
-        if best.kernel is not None:
-            bandwidth, kappa = HIT_KERNELS[best.kernel]
-            selection = replace(selection, hits_weight=best.hits_weight, hits_bandwidth=bandwidth, hits_kappa=kappa)
-        if len(self.folds) > 1:
-            fold = np.repeat(np.arange(len(self.folds)), [len(np.unique(fold.person)) for fold in self.folds])
-            crossed = [self._select_mixture(plain, with_hits, fold != k).gains[fold == k] for k in np.unique(fold)]
-            selection = replace(selection, bits_crossed=to_bits(np.concatenate(crossed)))
-        return replace(selection, regions=_calibrate_regions(self.folds, selection, best.kernel))
-
-    def _select_mixture(self, plain: np.ndarray, with_hits: Sequence[np.ndarray], mask: np.ndarray) -> _Mixture:
-        """Select the mixture that is best for the participants of ``mask`` (N,).
-
-        ``plain`` (N, W) are the gains of the candidates without re-aimed hits, ``with_hits`` those of `_WEIGHT_PAIRS`
-        for each of `HIT_KERNELS`.
-        """
-        index = _select_weight(plain[mask], self.caution)
-        best = _Mixture(float(PRIOR_WEIGHTS[index]), 0.0, None, plain[:, index])
-        candidates = []
-        for k, gains in enumerate(with_hits):
-            index = _select_weight(gains[mask], self.caution)
-            prior_weight, hits_weight = _WEIGHT_PAIRS[index].tolist()
-            candidates.append(_Mixture(prior_weight, hits_weight, k, gains[:, index]))
-        if candidates:
-            other = max(candidates, key=lambda mixture: mixture.gains[mask].mean())
-            gain = (other.gains - best.gains)[mask]
-            if gain.mean() > max(_MIN_HITS_GAIN, self.hits_caution * _standard_error(gain)):
-                return other
-        return best
-
-    def compute_gains(
-        self,
-        prior_weights: np.ndarray = PRIOR_WEIGHTS,
-        hits_weights: np.ndarray | float = 0.0,
-        kernel: int | None = None,
-        folds: int | None = None,
-    ) -> np.ndarray:
-        """Return the mean log density over that of the prior alone, in nats, of each held-out participant and with
-        each pair of weights (N, W), in the first ``folds`` folds.
-
-        ``kernel`` is the index of the re-aimed hits in `HIT_KERNELS`.
-        """
-        gains = []
-        for fold in self.folds[:folds]:
-            hits = 0.0 if kernel is None else fold.hits[:, kernel, None]
-            mixed = _mix(fold.field[:, None], fold.prior[:, None], hits, prior_weights, hits_weights)
-            gain = _log(mixed) - _log(fold.prior)[:, None]
-            gains += [gain[fold.person == p].mean(axis=0) for p in np.unique(fold.person)]
-        return np.array(gains)
+        return replace(selection, regions=_calibrate_regions(self.folds, selection))
 
     def compute_selected_gains(self, selection: PriorSelection, folds: int) -> np.ndarray:
-        """Return the same (N,) with the weights of ``selection``."""
-        weight, h = np.array([selection.prior_weight]), selection.hits_weight
-        kernel = HIT_KERNELS.index((selection.hits_bandwidth, selection.hits_kappa)) if h else None
-        return self.compute_gains(weight, h, kernel, folds)[:, 0]
+        """Return the mean log density over that of the prior alone, in nats, of each participant of the first ``folds``
+        folds (N,), with the weights of ``selection``."""
+        parts = [
+            _compute_gains(fold.densities, fold.person, _to_weights(selection, fold)[None])[:, 0]
+            for fold in self.folds[:folds]
+        ]
+        return np.concatenate(parts)
 
 
-def _mix(field: Any, prior: Any, hits: Any, prior_weight: Any, hits_weight: Any) -> np.ndarray:
-    return (1 - prior_weight - hits_weight) * field + prior_weight * prior + hits_weight * hits
+def _to_weights(selection: PriorSelection, fold: FoldDensities) -> np.ndarray:
+    """Return the weights of ``selection`` for the columns of ``fold.densities``."""
+    weights = np.zeros(fold.densities.shape[1])
+    weights[:2] = 1 - selection.prior_weight - selection.hits_weight, selection.prior_weight
+    for kernel in selection.hits:
+        weights[2 + HIT_KERNELS.index((kernel.bandwidth, kernel.kappa))] = kernel.weight
+    return weights
+
+
+def _shrink(weights: np.ndarray, shrinkages: np.ndarray) -> np.ndarray:
+    """Add the prior, the second component, with each of ``shrinkages`` (S,) to a mixture; returns weights (S, C)."""
+    is_prior = np.arange(len(weights)) == 1
+    return (1 - shrinkages[:, None]) * weights + shrinkages[:, None] * is_prior
+
+
+def _compute_gains(densities: np.ndarray, participant: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return the mean log density over that of the prior alone, in nats, of each participant and for each row of
+    ``weights`` (N, S)."""
+    gain = _log(densities @ weights.T) - _log(densities[:, [1]])
+    return np.array([gain[participant == p].mean(axis=0) for p in np.unique(participant)])
 
 
 def _standard_error(values: np.ndarray) -> np.ndarray:
@@ -465,9 +460,9 @@ def evaluate_folds(
     box = compute_observer_bounds(geometry.points_to_field(rays.origin), geometry.box)
     if settings.reaimed_hits:
         rays = replace(rays, hit=find_hit_points(rays, geometry, probes.depth))
-    for k, (train, held_out) in enumerate(iter_folds(rays, probes.radius, settings.prior_folds, settings.seed)):
+    for k, fold in enumerate(iter_folds(rays, probes.radius, settings.prior_folds, settings.seed)):
         try:
-            targets = make_targets_from_rays(train, geometry, plan.probes, needs, seed=settings.seed)
+            targets = make_targets_from_rays(fold.train, geometry, plan.probes, needs, seed=settings.seed)
         except NergError:
             # The remaining participants make no probe: skip this fold.
             continue
@@ -478,31 +473,30 @@ def evaluate_folds(
                 fraction = (k + trainer.progress) / settings.prior_folds
                 on_progress(GazeProgress(f"fold {k + 1}", fraction, trainer.steps, trainer.seconds, None))
                 stop.check()
-        test = sample_participants_equally(held_out, _MAX_RAYS, settings.seed + 3)
         assert targets.prior_table is not None  # The field has a prior
-        folds.append(_evaluate_fold(trainer, targets.prior_table, train, test, geometry, plan, needs))
+        folds.append(_evaluate_fold(trainer, targets.prior_table, fold, geometry, plan, needs))
         if len(folds) == _MIN_FOLDS and all(map(_needs_no_prior, folds)):
             # To select the re-aimed hits, enough participants must be held out.
             num_participants = sum(len(np.unique(fold.person)) for fold in folds)
             if not settings.reaimed_hits or num_participants >= _MIN_PARTICIPANTS:
                 break
     on_progress(GazeProgress("folds", 1.0, settings.steps or 0, 0.0, None))
-    cautions = (_CAUTION_WITHOUT_SURFACES,) * 2 if geometry.medium is None else ()
-    return FoldResults(config.mix, None if config.prior_factor else kappa, folds, *cautions)
+    caution = _CAUTION_WITHOUT_SURFACES if geometry.medium is None else _CAUTION
+    return FoldResults(config.mix, None if config.prior_factor else kappa, folds, caution)
 
 
 def _evaluate_fold(
     trainer: GazeTrainer,
     prior_table: np.ndarray,
-    train: Rays,
-    test: Rays,
+    fold: Fold,
     geometry: Environment,
     plan: GazePlan,
     needs: TargetRequirements,
 ) -> FoldDensities:
-    """Evaluate the field of ``trainer``, the prior in ``prior_table`` and the hits of the rays ``train`` at the rays
-    ``test``."""
+    """Evaluate the field of ``trainer``, the prior in ``prior_table`` and the hits of the training rays at some of the
+    held-out rays."""
     seed, rows, ns = plan.settings.seed, plan.config.prior, trainer.ns
+    test = fold.sample(_MAX_RAYS, seed + 3)
     maps = make_rotated_directions(_NUM_DIRECTIONS, len(test), np.random.default_rng(seed + 3))
     directions = geometry.directions_to_field(np.concatenate([maps, test.direction[:, None]], axis=1))
     positions = geometry.points_to_field(test.origin)
@@ -514,47 +508,41 @@ def _evaluate_fold(
     field /= 4 * np.pi * field[:, :-1].mean(axis=1, keepdims=True)
     log = interpolate_table(ns.Float(prior_table.ravel()), rows, to_vector(ns.Array3f, directions.reshape(-1, 3)))
     prior = np.exp(np.asarray(log, np.float64)).reshape(field.shape)
-    hits, nearest = np.empty((len(test), 0)), None
+    columns = [field[:, -1:], prior[:, -1:]]
+    train = sample_participants_equally(fold.train, MAX_HITS, seed + 5)
     if plan.settings.reaimed_hits:
-        train = sample_participants_equally(train, MAX_HITS, seed + 5)
-        hits, nearest = _evaluate_hit_kernels(train, geometry, positions, directions[:, -1], ns)
+        columns.append(_evaluate_hit_kernels(train, geometry, positions, directions[:, -1], ns))
 
-    def make_hit_maps(kernel: int) -> np.ndarray:
-        bandwidth, kappa = HIT_KERNELS[kernel]
-        kernels = _make_hits(train, geometry, bandwidth, kappa)
-        return kernels.make_kde(kernels.find(positions, nearest), ns).evaluate(directions[:, :-1])
+    def make_hit_maps(kernels: Sequence[HitKernel]) -> np.ndarray:
+        return _make_hits(train, geometry, kernels).observe(positions, ns).evaluate(directions[:, :-1])
 
-    return FoldDensities(test.person, field[:, -1], prior[:, -1], field[:, :-1], prior[:, :-1], hits, make_hit_maps)
+    densities = np.concatenate(columns, axis=1)
+    return FoldDensities(test.person, densities, field[:, :-1], prior[:, :-1], make_hit_maps, fold.train_fraction)
 
 
-def _make_hits(rays: Rays, geometry: Environment, bandwidth: float, kappa: float, weight: float = 1.0) -> ReaimedHits:
-    """Make the re-aimed hits of ``rays`` with hit points, if any; ``bandwidth`` is in metres."""
-    bandwidth *= geometry.align.scale
+def _make_hits(rays: Rays, geometry: Environment, kernels: Sequence[HitKernel]) -> ReaimedHits:
+    """Make the re-aimed hits of ``rays`` with hit points, if any; bandwidths of ``kernels`` are in metres."""
+    scale = geometry.align.scale
     origins, directions = geometry.points_to_field(rays.origin), geometry.directions_to_field(rays.direction)
     points = None if rays.hit is None else geometry.points_to_field(rays.hit)
-    points = place_missing_points(origins, directions, points, bandwidth)
-    return ReaimedHits(origins, points, weight, bandwidth, kappa)
+    points = place_missing_points(origins, directions, points, scale * max(kernel.bandwidth for kernel in kernels))
+    return ReaimedHits(origins, points, [kernel._replace(bandwidth=scale * kernel.bandwidth) for kernel in kernels])
 
 
 def _evaluate_hit_kernels(
     rays: Rays, geometry: Environment, positions: np.ndarray, directions: np.ndarray, ns: ModuleType
-) -> tuple[np.ndarray, NearestOrigins]:
-    """Evaluate the re-aimed hits of ``rays`` with each of `HIT_KERNELS` (n, C) in ``directions`` from ``positions``
-    (n, 3). Also returns the samples nearest to the positions, which are the same for all kernels."""
-    nearest = _make_hits(rays, geometry, *HIT_KERNELS[0]).find_nearest(positions)
-    columns, neighbours = [], {}
-    probe, d = dr.arange(ns.UInt32, len(positions)), to_vector(ns.Array3f, directions)
-    for bandwidth, kappa in HIT_KERNELS:
-        hits = _make_hits(rays, geometry, bandwidth, kappa)
-        if bandwidth not in neighbours:
-            neighbours[bandwidth] = hits.find(positions, nearest)
-        columns.append(np.array(hits.make_kde(neighbours[bandwidth], ns).density(probe, d), np.float64))
-    return np.stack(columns, axis=1), nearest
+) -> np.ndarray:
+    """Evaluate the re-aimed hits of ``rays`` with each of `HIT_KERNELS` (n, K) in ``directions`` from ``positions``
+    (n, 3)."""
+    hits = _make_hits(rays, geometry, [HitKernel(1 / len(HIT_KERNELS), *kernel) for kernel in HIT_KERNELS])
+    observed = hits.observe(positions, ns)
+    return observed.evaluate_kernels(to_vector(ns.Array3f, directions), dr.arange(ns.UInt32, len(positions)))
 
 
 def _needs_no_prior(fold: FoldDensities) -> bool:
-    """Return whether a small weight of the prior is best by far in this fold."""
-    gains = FoldResults(0.0, None, [fold]).compute_gains().mean(axis=0)
+    """Return whether a small weight of the prior is best by far in a mixture with the field of this fold."""
+    weights = np.stack([1 - PRIOR_WEIGHTS, PRIOR_WEIGHTS], axis=1)
+    gains = _compute_gains(fold.densities[:, :2], fold.person, weights).mean(axis=0)
     return bool(PRIOR_WEIGHTS[gains.argmax()] <= _SMALL_WEIGHT and gains.max() > _CLEAR_GAIN)
 
 
@@ -562,22 +550,20 @@ def _round_values(value):
     """Round the numbers in ``value`` to four digits."""
     if isinstance(value, dict):
         return {k: _round_values(v) for k, v in value.items()}
+    if isinstance(value, list):
+        return [_round_values(v) for v in value]
     return round(value, 4) if isinstance(value, float) else value
 
 
-def _calibrate_regions(
-    folds: Sequence[FoldDensities], selection: PriorSelection, kernel: int | None = None
-) -> dict[str, float]:
-    """Calibrate the region levels of the mixture ``selection`` on the held-out rays of all folds.
-
-    ``kernel`` is the index of its re-aimed hits in `HIT_KERNELS`.
-    """
-    levels, weights = [], (selection.prior_weight, selection.hits_weight)
+def _calibrate_regions(folds: Sequence[FoldDensities], selection: PriorSelection) -> dict[str, float]:
+    """Calibrate the region levels of the mixture ``selection`` on the held-out rays of all folds."""
+    levels, hits = [], selection.hits
     for fold in folds:
-        hit_maps, hits = (0.0, 0.0) if kernel is None else (fold.make_hit_maps(kernel), fold.hits[:, kernel])
-        maps = _mix(fold.field_maps, fold.prior_maps, hit_maps, *weights)
-        at_rays = _mix(fold.field, fold.prior, hits, *weights)
-        levels.append(compute_region_levels(maps, at_rays[:, None])[:, 0])
+        weights = _to_weights(selection, fold)
+        maps = weights[0] * fold.field_maps + weights[1] * fold.prior_maps
+        if hits:
+            maps += selection.hits_weight * fold.make_hit_maps(hits)
+        levels.append(compute_region_levels(maps, (fold.densities @ weights)[:, None])[:, 0])
     return calibrate_levels(np.concatenate(levels), np.ones(sum(map(len, levels))))
 
 

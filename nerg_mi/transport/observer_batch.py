@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import drjit as dr
 import numpy as np
 
-from nerg_mi.fields.kde import SphericalKde
+from nerg_mi.fields.gaze_hits import ObservedHits
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.maths.arrays import to_vector
 from nerg_mi.maths.sphere import fibonacci_directions_jit, morton_order
@@ -114,10 +114,10 @@ class _Block:
         if instance.field.config.needs_surfaces and instance.field.config.fills_escaped:
             self._miss_depths = list(self._trace_miss_depths())
         self._integrals = self._integrate() if instance.field.config.normalized else None
-        self._hits: SphericalKde | None = None
+        self._hits: ObservedHits | None = None
         if instance.field.hits is not None:
             local = np.array(instance.to_world.point_to_local(self._positions), np.float64).T
-            self._hits = instance.field.hits.make_kde(instance.field.hits.find(local), namespace(self._positions.x))
+            self._hits = instance.field.hits.observe(local, namespace(self._positions.x))
 
     def evaluate(self, observer: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Densities (members, N) of the observers with indices ``observer`` (N,), sorted, in ``directions`` (N, 3)."""
@@ -153,8 +153,8 @@ class _Block:
         gaze = gaze + dr.zeros(mi.Float, len(observer))
         if self._hits is None or field.hits is None:
             return gaze
-        d, ns = local.direction_to_local(lanes.r_o), self._hits.ns
-        return field.hits.mix(gaze, self._hits.density(ns.UInt32(observer), ns.Array3f(d.x, d.y, d.z)))
+        position, direction = local.point_to_local(lanes.p_o), local.direction_to_local(lanes.r_o)
+        return field.hits.mix(gaze, self._hits.density(direction, position, mi.UInt32(observer)))
 
     def _integrate(self) -> np.ndarray:
         """Integrals (members, M) over the sphere."""

@@ -7,7 +7,7 @@ import numpy as np
 
 from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.gaze_base import GazeEnsemble, make_prior_table
-from nerg_mi.fields.gaze_hits import ReaimedHits
+from nerg_mi.fields.gaze_hits import HitKernel, ReaimedHits
 from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
 from nerg_mi.fields.gaze_product import GazeConfig, ProductHead
 from nerg_mi.formats.fields import save_gaze
@@ -25,7 +25,9 @@ def made(kind: str, box: Box, seed: int = 4, **options):
         field = GazeEnsemble(members) if kind == "ensemble" else members[0]
         corners, rng = np.array([box.lower, box.upper]), np.random.default_rng(seed)
         origins, points = rng.uniform(*corners, (2, 50, 3))
-        field.hits = ReaimedHits(origins, points, 0.4, 0.3 * box.side, 30.0)
+        field.hits = ReaimedHits(
+            origins, points, [HitKernel(0.3, 0.3 * box.side, 30.0), HitKernel(0.1, 1.5 * box.side, 8.0)]
+        )
         return field
     rng = np.random.default_rng(seed)
     if kind == "default recipe":

@@ -9,11 +9,13 @@ import pytest
 
 from nerg_mi.evaluation import baselines
 from nerg_mi.evaluation.baselines import (
+    CONDITIONAL_HITS,
     CONDITIONAL_KDE,
     DEFAULT_SETTINGS,
     NEAREST_RAYS,
     PRIOR,
     REAIMED_HITS,
+    STACK,
     UNIFORM,
     NearestRays,
     NeighbourDensity,
@@ -24,7 +26,7 @@ from nerg_mi.evaluation.baselines import (
 )
 from nerg_mi.maths import vmf
 from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.tracking.folds import iter_folds
+from nerg_mi.tracking.folds import Fold, iter_folds
 from nerg_mi.tracking.probes import compute_participant_weights
 from nerg_mi.tracking.rays import Rays
 from tests.reference.kde import kde as reference
@@ -105,7 +107,7 @@ def test_tuned_settings_have_the_highest_density_of_held_out_rays():
     """All look at one object, so hit points predict best, with the concentration of the gaze."""
     rays = room(participants=6, spread=100.0)
     tuned = make_tuned_baselines(rays, 0.3, rays.hit)
-    assert list(tuned) == [UNIFORM, PRIOR, NEAREST_RAYS, CONDITIONAL_KDE, REAIMED_HITS]
+    assert list(tuned) == [UNIFORM, PRIOR, NEAREST_RAYS, CONDITIONAL_KDE, REAIMED_HITS, CONDITIONAL_HITS, STACK]
     assert all(tuned[name].folds == 4 for name in tuned if name not in (UNIFORM, PRIOR))
     settings = tuned[REAIMED_HITS].settings
     assert settings["kappa"] >= 100 and settings["prior weight"] <= 0.05 and settings["rays"] >= 256
@@ -114,6 +116,13 @@ def test_tuned_settings_have_the_highest_density_of_held_out_rays():
         name: np.log(baseline.density(new.origin, new.direction[:, None])).mean() for name, baseline in tuned.items()
     }
     assert log[UNIFORM] < log[PRIOR] < log[NEAREST_RAYS] < log[REAIMED_HITS]
+    assert tuned[CONDITIONAL_HITS].settings["kappa"] >= 100 and log[NEAREST_RAYS] < log[CONDITIONAL_HITS]
+    assert log[STACK] > log[NEAREST_RAYS] and tuned[STACK].settings["kernels"] > 1
+    for name in (CONDITIONAL_HITS, STACK):
+        density = tuned[name].density(AT, X)
+        assert density.shape == (2, 1024) and 4 * np.pi * density.mean(axis=1) == pytest.approx(1, abs=0.02)
+        individual = tuned[name].density(AT, np.stack([X, X[::-1]]))
+        np.testing.assert_allclose(individual[1, ::-1], density[1], rtol=1e-5)
     text = format_settings(tuned)
     assert "re-aimed hits (rays" in text and "not tuned" not in text
 
@@ -124,13 +133,13 @@ def test_without_hit_points_there_are_no_re_aimed_hits():
 
 
 def test_folds_and_their_samples_follow_the_seed(monkeypatch):
-    rays, draw, samples = replace(room(participants=3, count=900), hit=None), baselines.sample_participants_equally, []
+    rays, draw, samples = replace(room(participants=3, count=900), hit=None), Fold.sample, []
 
-    def record(held_out: Rays, count: int, seed: int) -> Rays:
-        samples.append((held_out.t, seed))
-        return draw(held_out, count, seed)
+    def record(fold: Fold, count: int, seed: int) -> Rays:
+        samples.append((fold.held_out.t, seed))
+        return draw(fold, count, seed)
 
-    monkeypatch.setattr(baselines, "sample_participants_equally", record)
+    monkeypatch.setattr(Fold, "sample", record)
     assert REAIMED_HITS not in make_tuned_baselines(rays, 0.5, np.full((900, 3), np.nan), prior_kappa=10.0, seed=5)
     folds, others = ([fold.held_out.t for fold in iter_folds(rays, 0.5, 4, seed)] for seed in (5, 0))
     assert len(samples) == len(folds) and not all(map(np.array_equal, folds, others))

@@ -18,6 +18,7 @@ from nerg_mi.environment.gaze import GazeField
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation import folds as folding
 from nerg_mi.evaluation import held_out, next_look_scores
+from nerg_mi.evaluation.baselines import PRIOR
 from nerg_mi.evaluation.folds import SCORED, folds
 from nerg_mi.evaluation.gaze import SCORES
 from nerg_mi.evaluation.gaze_report import read_results
@@ -71,6 +72,10 @@ def test_scores_are_listed_with_the_baselines(trained, tmp_path):
         with open(tmp_path / "eval" / name, encoding="utf-8", newline="") as file:
             assert not find_wrong_notes(csv.DictReader(file)), name
     assert read_results(tmp_path / "eval" / "gaze.json").rows[0]["note"] == result.rows[0]["note"]
+    # Nobody was held out, so all rays are at held-out positions.
+    assert {row["kind"] for row in result.verdicts} == {"new positions"}
+    assert {row["method"] for row in result.verdicts} >= {"gaze field", "stack", "re-aimed hits"}
+    assert [row["bits"] for row in result.verdicts if row["method"] == PRIOR] == [0]
     # Calibrated on the data that the folds of the training held out.
     assert result.calibration[1]["method"] == "gaze field, calibrated"
     data = json.loads((tmp_path / "eval" / "gaze.json").read_text())
@@ -243,9 +248,8 @@ def folds_trained(monkeypatch):
     def score(common, seed, output):
         seeds.append(seed)
         rows = [{"method": "gaze field", "KLD": 1.0 / (1 + seed), "CC": 0.5}]
-        write_json(
-            output / SCORED, {split: {"rows": rows, "by_position": [], "calibration": []} for split in common.splits}
-        )
+        tables = {"rows": rows, "by_position": [], "calibration": [], "verdicts": []}
+        write_json(output / SCORED, dict.fromkeys(common.splits, tables))
 
     score.__qualname__ = "train_and_score"
 
@@ -283,7 +287,12 @@ def test_missing_values_of_folds_have_a_reason(tmp_path, monkeypatch):
             region |= {"80%.low": 0.7, "80%.high": 0.9}
         else:
             rows[1] |= {"bits at own origin": np.nan, "bits.gap": 0.0}
-        tables = {"rows": rows, "by_position": [position], "calibration": [region]}
+        verdict = {"kind": "new positions", "method": "gaze field", "bits": 0.5, "rays": 40, "people": 2}
+        baseline = verdict | {"method": "b", "bits.gap": 0.1}
+        if seed:
+            verdict |= {"bits.low": 0.0, "bits.high": 2.0}
+            baseline |= {"bits.low": 0.0, "bits.high": 2.0, "bits.gap.low": 0.0, "bits.gap.high": 0.1}
+        tables = {"rows": rows, "by_position": [position], "calibration": [region], "verdicts": [verdict, baseline]}
         write_json(output / SCORED, dict.fromkeys(common.splits, tables), allow_nan=True)
 
     score.__qualname__ = "train_and_score"

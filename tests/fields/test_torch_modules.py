@@ -13,7 +13,7 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.gaze_base import GazeEnsemble
-from nerg_mi.fields.gaze_hits import ReaimedHits
+from nerg_mi.fields.gaze_hits import HitKernel, ReaimedHits
 from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
 from nerg_mi.fields.gaze_product import GazeConfig, ProductHead
 from nerg_mi.fields.radiance import Background, BackgroundConfig, RadianceConfig, RadianceNetwork
@@ -293,7 +293,7 @@ def test04b_a_normalised_gaze_field(torch, interop, rgb, kind, tmp_path):
 def test04e_reaimed_hits(torch, interop, rgb, members):
     """Their density is an argument, as the integral is."""
     field = normalised("log") if members == 1 else GazeEnsemble([normalised("log") for _ in range(members)])
-    field.hits = ReaimedHits(RNG.uniform(-1, 1, (40, 3)), RNG.uniform(-1, 1, (40, 3)), 0.4, 0.3, 30.0)
+    field.hits = ReaimedHits(*RNG.uniform(-1, 1, (2, 40, 3)), [HitKernel(0.3, 0.3, 30.0), HitKernel(0.1, 0.6, 10.0)])
     module = (interop.GazeModule if members == 1 else interop.GazeEnsembleModule)(field)
     place, eyes = SceneGeometry(None, rgb.load_dict({"type": "scene"})), torch.tensor([[0.1, -0.2, 0.3], [-0.5, 0, 0]])
     observers = [rgb.Point3f(*eye) for eye in eyes.tolist()]

@@ -11,7 +11,7 @@ from safetensors.numpy import save_file
 from nerg_mi.errors import NergError
 from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.gaze_base import max_sizes_of
-from nerg_mi.fields.gaze_hits import ReaimedHits
+from nerg_mi.fields.gaze_hits import HitKernel, ReaimedHits
 from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
 from nerg_mi.fields.gaze_product import GazeConfig, ProductHead
 from nerg_mi.fields.mlp import MLP
@@ -272,25 +272,36 @@ def test02c_reaimed_hits_of_gaze_fields(tmp_path):
     """Stored exactly, also with fp16 weights; damaged ones are refused in a sentence."""
     path, rng = tmp_path / "g.safetensors", np.random.default_rng(0)
     field = gaze_fields.made("default recipe", BOX)
-    field.hits = ReaimedHits(rng.normal(size=(9, 3)), rng.normal(size=(9, 3)), 0.25, 0.4, 60.0)
+    field.hits = ReaimedHits(*rng.normal(size=(2, 9, 3)), [HitKernel(0.25, 0.4, 60.0), HitKernel(0.1, 2.0, 9.0)])
     save_gaze(field, path, {}, half=True)
     hits = load_gaze(path, ns)[0].hits
-    assert (hits.weight, hits.bandwidth, hits.kappa) == (0.25, 0.4, 60.0)
+    assert hits.kernels == field.hits.kernels
     assert np.array_equal(hits.origins, field.hits.origins) and np.array_equal(hits.points, field.hits.points)
     for change, message in (
         (without("hits.points"), "lacks"),
         (array("hits.points", (8, 3)), "one point for each"),
         (array("hits.origins", (9, 2)), "has shape"),
-        (metadata(2.0, "hits", "weight"), "weight"),
-        (metadata("near", "hits", "bandwidth"), "bandwidth"),
-        (metadata(0, "hits", "kappa"), "concentration"),
-        (metadata([], "hits"), "re-aimed hits|hits"),
+        (metadata(2.0, "hits", "kernels", 0, 0), "weight"),
+        (metadata("near", "hits", "kernels", 0, 1), "bandwidth"),
+        (metadata(0, "hits", "kernels", 0, 2), "concentration"),
+        (metadata([0.5, 1.0], "hits", "kernels", 0), "no usable field"),
+        (metadata([], "hits", "kernels"), "1 to 64 kernels"),
+        (metadata(3, "hits", "kernels"), "must be a list"),
+        (metadata([], "hits"), "no usable field"),
     ):
         tensors, meta = read_checkpoint(path, "gaze")
         change(tensors, meta)
         write_checkpoint(tmp_path / "h.safetensors", "gaze", tensors, meta)
         with pytest.raises(NergError, match=message):
             load_gaze(tmp_path / "h.safetensors", ns)
+
+
+def test02d_reaimed_hits_of_earlier_versions_have_one_kernel(tmp_path):
+    path = gaze_fields.saved(tmp_path / "g.safetensors", "re-aimed hits", BOX) and tmp_path / "g.safetensors"
+    tensors, meta = read_checkpoint(path, "gaze")
+    meta["hits"] = {"weight": 0.25, "bandwidth": 0.4, "kappa": 60.0}
+    write_checkpoint(path, "gaze", tensors, meta)
+    assert load_gaze(path, ns)[0].hits.kernels == (HitKernel(0.25, 0.4, 60.0),)
 
 
 RADIANCE_NAMES = ("grid.table", "density_net.0", "color_net.1", "occupancy.bits")

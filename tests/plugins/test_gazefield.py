@@ -65,7 +65,7 @@ def test02b_reaimed_hits_are_mixed_in_unless_left_out(rgb, tmp_path, kind):
     p_o, r_o = np.array([0.2, -0.3, 0.1]), np.array([0.6, 0.0, 0.8])
     volumes = [stored("gazefield", path, reaimed_hits=value) for value in (True, False)]
     mixed, plain = (ask(rgb, volume, p_o + 0.3 * r_o, p_o, r_o)[0] for volume in volumes)
-    density = hits.make_kde(hits.find(p_o), ns).evaluate(r_o[None])[0, 0]
+    density = hits.observe(p_o, ns).evaluate(r_o[None])[0, 0]
     assert mixed == pytest.approx((1 - hits.weight) * plain + hits.weight * density, rel=1e-4)
     assert abs(mixed / plain - 1) > 0.01
 

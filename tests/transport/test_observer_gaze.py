@@ -147,7 +147,8 @@ def test_several_observers_equal_single_ones_with_reaimed_hits(rgb, monkeypatch,
 def test_gradients_include_reaimed_hits(rgb):
     """With the networks' weight near zero, they are those of the hits."""
     field = made("re-aimed hits", BOX)
-    field.hits.weight = 1.0
+    kernels = [kernel._replace(weight=kernel.weight / field.hits.weight) for kernel in field.hits.kernels]
+    field.hits = gaze_hits.ReaimedHits(field.hits.origins, field.hits.points, kernels)
     gaze, geometry = GazeFieldInstance(field, Similarity(np.diag([2.0, 2, 2, 1]))), room(rgb)
     d = rgb.Vector3f(fibonacci_directions(30).T.astype(np.float32))
 

@@ -17,7 +17,7 @@ from nerg_mi.fields.gaze_base import (
     summarize_provenance,
     tracking_suffix,
 )
-from nerg_mi.fields.gaze_hits import ReaimedHits
+from nerg_mi.fields.gaze_hits import HitKernel, ReaimedHits
 from nerg_mi.fields.gaze_log_density import LogGazeField
 from nerg_mi.fields.gaze_product import GazeConfig, ProductHead
 from nerg_mi.fields.mlp import namespace
@@ -221,7 +221,7 @@ def test_nested_ensembles_are_refused(tmp_path):
 def test_members_have_no_hits_of_their_own():
     """They would be lost, because an ensemble mixes in its own."""
     member = made()
-    member.hits = ReaimedHits(np.zeros((1, 3)), np.ones((1, 3)), 0.5, 0.4, 50.0)
+    member.hits = ReaimedHits(np.zeros((1, 3)), np.ones((1, 3)), [HitKernel(0.5, 0.4, 50.0)])
     with pytest.raises(ValueError, match="reaimed_hits=False"):
         GazeEnsemble([member, made(seed=1)])
 

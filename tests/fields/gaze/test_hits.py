@@ -7,7 +7,7 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.fields.gaze_hits import FAR, MAX_NEIGHBOURS, ObservedHits, ReaimedHits, place_missing_points
+from nerg_mi.fields.gaze_hits import FAR, MAX_NEIGHBOURS, HitKernel, ObservedHits, ReaimedHits, place_missing_points
 from nerg_mi.maths.arrays import to_vector
 from nerg_mi.maths.sphere import fibonacci_directions
 
@@ -39,7 +39,7 @@ def evaluate(hits, p, d):
 @pytest.mark.parametrize("kappa", [1.0, 60.0, 2000.0])
 def test_density_equals_float64(p, kappa):
     origins, points = sample()
-    hits = ReaimedHits(origins, points, 0.5, 0.4, kappa)
+    hits = ReaimedHits(origins, points, [HitKernel(0.5, 0.4, kappa)])
     for count in (500, 20_000):  # summed, and tabulated
         d = fibonacci_directions(count)
         expected = reference(hits.origins.astype(float), hits.points.astype(float), 0.4, kappa, np.array(p), d)
@@ -57,44 +57,73 @@ def test_samples_without_a_hit_keep_their_direction():
     placed = place_missing_points(origins, directions, points, 0.4)
     assert np.array_equal(placed[0], points[0])
     np.testing.assert_allclose(np.linalg.norm(placed[1:] - origins[1:], axis=1), 0.4 * FAR)
-    near = ReaimedHits(origins, placed, 0.5, 0.4, 50.0).find(np.array([(0.2, 0.1, 0.0)]))
+    near = ReaimedHits(origins, placed, [HitKernel(0.5, 0.4, 50.0)]).find(np.array([(0.2, 0.1, 0.0)]))[0]
     order = [int(np.argmin(np.abs(origins - (0.2, 0.1, 0) - offset).sum(axis=1))) for offset in near.offsets[0]]
     rows = [order.index(k) for k in range(1, 5)]
     np.testing.assert_allclose(near.directions[0][rows], directions[1:], atol=1e-3)
     assert np.array_equal(place_missing_points(origins, directions, None, 0.4)[1:], placed[1:])
     # In millimetres, with a bandwidth of several metres
     far = place_missing_points(1e3 * origins, directions, None, 5e3)
-    assert ReaimedHits(1e3 * origins, far, 0.5, 5e3, 50.0).find(origins).directions.shape == (5, 5, 3)
+    assert ReaimedHits(1e3 * origins, far, [HitKernel(0.5, 5e3, 50.0)]).find(origins)[0].directions.shape == (5, 5, 3)
 
 
-def test_nearest_samples_are_shared_by_bandwidths():
-    origins, points = sample()
-    positions = np.array([(0.2, 0.1, 0.0), (-0.7, 0.3, 0.5)])
-    nearest = ReaimedHits(origins, points, 0.5, 0.4, 60.0).find_nearest(positions)
-    assert (np.diff(nearest.distance, axis=1) >= 0).all()
-    other = ReaimedHits(origins, points + 1, 0.5, 2.0, 60.0)
-    for shared, separate in zip(other.find(positions, nearest), other.find(positions)):
-        np.testing.assert_array_equal(shared, separate)
+def test_kernels_are_mixed():
+    """The density is the mean of those of the kernels, and has their derivatives."""
+    origins, points = sample(60, 3)
+    kernels = HitKernel(0.3, 0.4, 60.0), HitKernel(0.1, 0.4, 10.0), HitKernel(0.2, 2.0, 60.0)
+    hits, p = ReaimedHits(origins, points, kernels), np.array((0.2, 0.1, 0.0))
+    assert hits.weight == pytest.approx(0.6)
+
+    def derive(hits, d):
+        r_o, p_o = to_vector(ns.Array3f, d), ns.Array3f(*p.tolist())
+        dr.enable_grad(r_o, p_o)
+        density = hits.observe(p, ns).density(r_o, p_o)
+        dr.backward(dr.sum(density))
+        return [np.array(v) for v in (density, dr.grad(r_o), dr.grad(p_o))]
+
+    single = [ReaimedHits(origins, points, [kernel]) for kernel in kernels]
+    for d in (fibonacci_directions(50), fibonacci_directions(20_000)):  # without tables, and with some
+        for value, *parts in zip(derive(hits, d), *(derive(part, d) for part in single)):
+            expected = sum(k.weight * part for k, part in zip(kernels, parts)) / 0.6
+            np.testing.assert_allclose(value, expected, rtol=2e-3, atol=5e-4)
+    d = fibonacci_directions(50)
+    columns = hits.observe(p, ns).evaluate_kernels(to_vector(ns.Array3f, d), dr.zeros(ns.UInt32, 50))
+    np.testing.assert_allclose(hits.observe(p, ns).evaluate(d)[0], columns @ [1 / 2, 1 / 6, 1 / 3], rtol=1e-5)
+
+
+def test_wide_kernels_sum_a_random_subset():
+    """The nearest samples alone would be those of a small part of the neighbourhood."""
+    rng = np.random.default_rng(0)
+    origins, points = rng.uniform(-1, 1, (20_000, 3)), np.zeros((20_000, 3))
+    # All look up, but those who stand near the middle look down.
+    points[:, 2] = origins[:, 2] + np.where(np.linalg.norm(origins, axis=1) < 0.4, -1e4, 1e4)
+    up = np.array([(0, 0, 1.0)])
+    wide, narrow = (evaluate(ReaimedHits(origins, points, [HitKernel(1, b, 50.0)]), (0, 0, 0), up) for b in (2.0, 0.1))
+    peak = 50 / (2 * np.pi)
+    is_up = np.linalg.norm(origins, axis=1) >= 0.4
+    weights = np.exp(-(origins**2).sum(axis=1) / 8)
+    assert wide / peak == pytest.approx(np.average(is_up, weights=weights), abs=0.02)
+    assert narrow / peak < 0.01
 
 
 def test_extreme_positions_are_finite():
     origins, points = sample(3)
     points[0] = origins[0]  # A hit at the eye has no direction
-    hits = ReaimedHits(origins, points, 0.5, 1e-3, 1e5)
+    hits = ReaimedHits(origins, points, [HitKernel(0.5, 1e-3, 1e5)])
     d = fibonacci_directions(2000)
     for p in (origins[0], points[1], origins[0] + 1e-9, (1e6, 0, 0), (0, 0, 0)):
         value = evaluate(hits, p, d)
         assert np.isfinite(value).all() and (value >= 0).all()
     # Too narrow for a table, however many directions there are
-    narrow = ReaimedHits(origins, points, 0.5, 0.4, 1e8)
+    narrow = ReaimedHits(origins, points, [HitKernel(0.5, 0.4, 1e8)])
     assert np.isfinite(evaluate(narrow, (0, 0, 0), fibonacci_directions(20_000))).all()
     # Only the sample at the eye, of which nothing is known
-    assert np.isfinite(evaluate(ReaimedHits(origins[:1], points[:1], 1.0, 0.4, 50.0), origins[0], d)).all()
+    assert np.isfinite(evaluate(ReaimedHits(origins[:1], points[:1], [HitKernel(1.0, 0.4, 50.0)]), origins[0], d)).all()
 
 
 def test_only_the_nearest_samples_count():
     origins, points = sample(MAX_NEIGHBOURS + 200)
-    near = ReaimedHits(origins, points, 0.5, 0.4, 50.0).find(np.zeros((2, 3)))
+    near = ReaimedHits(origins, points, [HitKernel(0.5, 0.4, 50.0)]).find(np.zeros((2, 3)))[0]
     assert near.directions.shape == (2, MAX_NEIGHBOURS, 3) and near.weights.max() == 1
     square = np.sort((origins.astype(np.float32).astype(float) ** 2).sum(axis=1))[:MAX_NEIGHBOURS]
     np.testing.assert_allclose((near.offsets[0] ** 2).sum(axis=1), square)
@@ -102,7 +131,7 @@ def test_only_the_nearest_samples_count():
 
 def test_gradients_equal_finite_differences():
     origins, points = sample(60, 3)
-    hits = ReaimedHits(origins, points, 0.5, 0.5, 20.0)
+    hits = ReaimedHits(origins, points, [HitKernel(0.5, 0.5, 20.0)])
     p, d = np.array((0.1, -0.2, 0.3)), fibonacci_directions(50)
     observed = hits.observe(p, ns)
     r_o, p_o = to_vector(ns.Array3f, d), ns.Array3f(*p.tolist())
@@ -129,7 +158,7 @@ def test_gradients_equal_finite_differences():
 
 def test_merged_observers_equal_single_ones():
     origins, points = sample(60, 5)
-    hits = ReaimedHits(origins, points, 0.5, 0.5, 20.0)
+    hits = ReaimedHits(origins, points, [HitKernel(0.5, 0.5, 20.0)])
     positions, d = np.array([(0.1, -0.2, 0.3), (0.4, 0.1, -0.2)]), fibonacci_directions(40)
     single = [hits.observe(p, ns) for p in positions]
     index = np.arange(40) % 2
@@ -159,13 +188,15 @@ def _radial(at, p, d, step):
         {"origins": np.zeros((0, 3)), "points": np.zeros((0, 3))},
         {"points": np.zeros((2, 3))},
         {"points": np.full((40, 3), np.nan)},
-        {"weight": 1.5},
-        {"bandwidth": 0.0},
-        {"kappa": -1.0},
+        {"kernels": ()},
+        {"kernels": [(0.6, 0.4, 50.0), (0.6, 0.4, 100.0)]},
+        {"kernels": [(1.5, 0.4, 50.0)]},
+        {"kernels": [(0.5, 0.0, 50.0)]},
+        {"kernels": [(0.5, 0.4, -1.0)]},
     ],
 )
 def test_bad_values_are_refused(change):
     origins, points = sample()
-    values = {"origins": origins, "points": points, "weight": 0.5, "bandwidth": 0.4, "kappa": 50.0, **change}
+    values = {"origins": origins, "points": points, "kernels": [(0.5, 0.4, 50.0)], **change}
     with pytest.raises(ValueError, match="re-aimed hits need"):
         ReaimedHits(**values)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import drjit.llvm.ad as ns
@@ -86,8 +87,8 @@ def plan_of(**changes):
 
 def make_fold(person, field, prior, field_maps, prior_maps, hits=None, hit_maps=None):
     """Densities of a fold; ``hits`` (n, C) and ``hit_maps`` (n, D) are those of re-aimed hits."""
-    hits = np.empty((len(person), 0)) if hits is None else hits
-    return FoldDensities(person, field, prior, field_maps, prior_maps, hits, lambda kernel: hit_maps)
+    densities = np.column_stack([field, prior, *([] if hits is None else [hits])])
+    return FoldDensities(person, densities, field_maps, prior_maps, lambda kernels: hit_maps)
 
 
 def test02_the_best_weight_is_selected_where_the_field_is_clearly_better():
@@ -109,59 +110,52 @@ def test02_the_best_weight_is_selected_where_the_field_is_clearly_better():
 
 def test03_the_weight_maximises_the_held_out_likelihood():
     """The field holds for half of the rays of each participant, and the prior for the others."""
-    field, prior = np.tile([1.0, 0.01], 50), np.tile([0.02, 0.3], 50)
-    uniform = np.full((100, 8), 1 / (4 * np.pi))
-    fold = make_fold(np.repeat([0, 1], 50), field, prior, uniform, uniform)
+    field, prior = np.tile([1.0, 0.01], 1000), np.tile([0.02, 0.3], 1000)
+    uniform, person = np.full((2000, 8), 1 / (4 * np.pi)), np.repeat(np.arange(200), 10)
+    fold = make_fold(person, field, prior, uniform, uniform)._replace(train_fraction=0.6)
     result = FoldResults(0.1, 20.0, [fold, fold]).select()
-    expected = max(PRIOR_WEIGHTS, key=lambda m: np.log((1 - m) * field + m * prior).mean())
-    assert result.prior_weight == expected and result.bits > max(0, result.bits_field)
-    assert result.folds == 2 and result.prior_kappa == 20.0  # noqa: RUF069 (stored)
+    expected = max(np.linspace(0.01, 0.99, 99), key=lambda m: np.log((1 - m) * field + m * prior).mean())
+    assert result.prior_weight == pytest.approx(expected, abs=0.03) and result.bits > max(0, result.bits_field)
+    assert result.folds == 2 and result.prior_kappa == 20.0 and result.train_fraction == 0.6  # noqa: RUF069 (stored)
 
 
 def test03a_bits_with_weights_of_other_folds():
-    """The participant of the first fold is predicted by the field, and that of the second by the prior."""
-    person, uniform, min_weight = np.zeros(1, int), np.full((1, 8), 1 / (4 * np.pi)), PRIOR_WEIGHTS[0]
+    """The participants of the first fold are predicted by the field, and those of the second by the prior."""
+    person, uniform = np.arange(40), np.full((40, 8), 1 / (4 * np.pi))
     densities = ((1.0, 0.1), (0.01, 1.0))
-    folds = [make_fold(person, np.array([f]), np.array([p]), uniform, uniform) for f, p in densities]
-    assert [FoldResults(0.1, 20.0, [fold]).select().prior_weight for fold in folds] == [min_weight, 1.0]
-    assert FoldResults(0.1, 20.0, folds[:1]).select().bits_crossed is None
-    # The first participant with the weight of the second, and the second with that of the first.
-    crossed = 0.5 * (0 + np.log2((1 - min_weight) * 0.01 + min_weight * 1.0))
+    folds = [make_fold(person, np.full(40, f), np.full(40, p), uniform, uniform) for f, p in densities]
+    alone = [FoldResults(0.1, 20.0, [fold]).select() for fold in folds]
+    assert alone[0].prior_weight < 0.1 and alone[1].prior_weight == 1
+    # The weights of one fold fail in the other, so hardly more than the prior is used.
     selection = FoldResults(0.1, 20.0, folds).select()
-    assert selection.bits_crossed == pytest.approx(crossed) and selection.bits > selection.bits_crossed
-    # Equal folds select equal weights.
+    assert selection.prior_weight > 0.9 and selection.bits_crossed <= selection.bits
+    # Equal folds select equal weights; of a single participant nobody else is there.
     same = FoldResults(0.1, 20.0, [folds[0], folds[0]]).select()
-    assert (
-        same.bits_crossed
-        == pytest.approx(same.bits)
-        == np.log2((1 - min_weight) * 1.0 + min_weight * 0.1) - np.log2(0.1)
-    )
+    assert 0 < same.bits_crossed < same.bits < np.log2(10)
+    one = make_fold(np.zeros(1, int), np.ones(1), np.full(1, 0.1), uniform[:1], uniform[:1])
+    assert FoldResults(0.1, 20.0, [one]).select().bits_crossed is None
 
 
-def test03b_hits_have_weight_only_if_they_improve_the_mixture():
-    """Field, prior and the hits with one of the kernels hold for a third of the rays each."""
-    third = np.tile(np.eye(3), (20, 1)) + 0.01
-    person, uniform = np.repeat(np.arange(4), 15), np.full((60, 8), 1 / (4 * np.pi))
-    hits = np.tile(third[:, :1] * 0.5, len(HIT_KERNELS))
-    useless = make_fold(person, third[:, 0], third[:, 1], uniform, uniform, hits, uniform)
-    selection = FoldResults(0.1, 20.0, [useless]).select()
-    assert selection.hits_weight == 0 and selection.hits_kappa is None
-    assert selection.prior_weight == FoldResults(0.1, 20.0, [useless._replace(hits=hits[:, :0])]).select().prior_weight
-    hits = hits.copy()
-    hits[:, 4] = third[:, 2]
-    results = FoldResults(0.1, 20.0, [useless._replace(hits=hits)])
+def test03b_hits_have_weight_if_they_improve_the_mixture():
+    """Field, prior and the hits with two of the kernels hold for a quarter of the rays each."""
+    quarter = np.tile(np.eye(4), (150, 1)) + 0.01
+    person, uniform = np.repeat(np.arange(50), 12), np.full((600, 8), 1 / (4 * np.pi))
+    hits = np.full((600, len(HIT_KERNELS)), 0.01)
+    useless = make_fold(person, *quarter[:, :2].T, uniform, uniform, hits, uniform)
+    assert FoldResults(0.1, 20.0, [useless]).select().hits == ()
+    hits[:, [4, 9]] = quarter[:, 2:]
+    results = FoldResults(0.1, 20.0, [make_fold(person, *quarter[:, :2].T, uniform, uniform, hits, uniform)])
     selection = results.select()
-    assert (selection.hits_bandwidth, selection.hits_kappa) == HIT_KERNELS[4]
-    assert selection.hits_weight == pytest.approx(1 / 3, abs=0.06)
-    assert selection.prior_weight == pytest.approx(1 / 3, abs=0.06)
+    assert [kernel[1:] for kernel in selection.hits] == [HIT_KERNELS[4], HIT_KERNELS[9]]
+    assert selection.prior_weight == pytest.approx(0.25, abs=0.06)
+    assert [kernel.weight for kernel in selection.hits] == pytest.approx([0.25, 0.25], abs=0.06)
     gains = results.compute_selected_gains(selection, 1)
     assert gains.mean() / np.log(2) == pytest.approx(selection.bits) and selection.bits > selection.bits_field
-    assert PriorSelection.from_dict(selection.to_dict()) == PriorSelection(
-        **{k: _round_values(v) for k, v in vars(selection).items()}
-    )
-    for change in ({"hits_weight": 0.9}, {"hits_bandwidth": None}, {"hits_kappa": -1.0}):
-        with pytest.raises(ValueError, match="hits_"):
-            PriorSelection.from_dict({**selection.to_dict(), **change})
+    restored = PriorSelection.from_dict(json.loads(json.dumps(selection.to_dict())))
+    assert restored == PriorSelection(**{k: _round_values(v) for k, v in vars(selection).items()})
+    for rows in ([[0.9, 0.1, 10.0]], [[0.1, 0.0, 10.0]], [[0.1, 0.1, -1.0]]):
+        with pytest.raises(ValueError, match="hits"):
+            PriorSelection.from_dict({**selection.to_dict(), "hits": rows})
 
 
 def test03c_hits_are_seen_from_the_observer():
@@ -171,9 +165,9 @@ def test03c_hits_are_seen_from_the_observer():
     positions, directions = rng.uniform(0, 2, (7, 3)), fibonacci_directions(7)
     for hit in (None, rays.origin + 3 * rays.direction):
         rays = replace(rays, hit=hit)
-        columns, _ = _evaluate_hit_kernels(rays, NOWHERE, positions, directions, ns)
+        columns = _evaluate_hit_kernels(rays, NOWHERE, positions, directions, ns)
+        far = rays.origin + FAR * max(bandwidth for bandwidth, _ in HIT_KERNELS) * rays.direction
         for column, (bandwidth, kappa) in zip(columns.T, HIT_KERNELS):
-            far = rays.origin + FAR * bandwidth * rays.direction
             points = far if hit is None else hit
             expected = [reference(rays.origin, points, bandwidth, kappa, p, d) for p, d in zip(positions, directions)]
             np.testing.assert_allclose(column, expected, rtol=5e-3, atol=1e-5)
@@ -198,15 +192,13 @@ def test05_of_a_training_and_of_an_ensemble(rgb):
     rays = people(0.0)
     plan = plan_of(steps=20)
     field, provenance = fit_gaze(Supervision(rays), NOWHERE, plan, ns)
-    assert (
-        field.config.mix
-        == provenance["mix"]["mix"]
-        == PRIOR_WEIGHTS[np.isclose(PRIOR_WEIGHTS, provenance["mix"]["mix"])][0]
-    )
+    assert field.config.mix == provenance["mix"]["mix"] > 0
     ensemble, provenance = train_ensemble(2, Supervision(rays), NOWHERE, plan, ns)
     assert [f.config.mix for f in ensemble.members] == [provenance["mix"]["mix"]] * 2
-    # No position has enough rays to hold out, so the weight stays.
-    few, provenance = fit_gaze(Supervision(people(0.0, each=12)), NOWHERE, plan, ns)
+    # Nothing can be held out of one participant at one position, so the weight stays.
+    seated = people(0.0, count=1)
+    seated = replace(seated, origin=np.full_like(seated.origin, 1.6))
+    few, provenance = fit_gaze(Supervision(seated), NOWHERE, plan, ns)
     assert few.config.mix == LOG.mix and provenance["mix"]["mix"] == LOG.mix and provenance["mix"]["folds"] == 0
     assert provenance["mix"]["regions"] is None
     assert PriorSelection(0.5, 1, regions={"80%": 0.71234}).to_dict()["regions"] == {"80%": 0.7123}
@@ -246,12 +238,19 @@ def two(**changes):
     return replace(plan_of(**changes), config=CAPTURE, alternatives=(BOTH,))
 
 
+class FixedWeight(FoldResults):
+    """Folds that select the smallest weight of the prior."""
+
+    def select(self):
+        return PriorSelection(float(PRIOR_WEIGHTS[0]) if self.folds else self.default_weight, len(self.folds))
+
+
 def scored(*gains):
     """Folds in which a field exceeds the prior by ``gains`` nats with the smallest weight."""
     uniform = np.ones((1, 4))
     scale = lambda gain: (np.exp(gain) - PRIOR_WEIGHTS[0]) / (1 - PRIOR_WEIGHTS[0])
     make = lambda gain: make_fold(np.zeros(1, int), np.full(1, scale(gain)), np.ones(1), uniform, uniform)
-    return FoldResults(0.1, None, [make(gain) for gain in gains])
+    return FixedWeight(0.1, None, [make(gain) for gain in gains])
 
 
 def test01_the_first_variant_is_kept_unless_another_is_better():

@@ -99,9 +99,9 @@ def test_a_training_returns_the_field_and_reports_progress(rays):
     last_fit = max(share for share, text in zip(heard.shares, heard.texts) if text.startswith("fit"))
     assert last_fit == pytest.approx(1 / (1 + provenance["settings"]["prior_folds"]))
     assert heard.texts[0].startswith("placing probes") and "fit: step 3" in heard.texts
-    assert heard.texts[-1].startswith("folds: step") and provenance["mix"]["folds"] == 1
+    assert heard.texts[-1].startswith("folds: step") and provenance["mix"]["folds"] == 2
     summaries = [m.split(";")[0].split(":")[0] for m in heard.messages]
-    assert summaries[:3] == [f"{provenance['probes_made']} probes", "3 steps", "cross-validation (1 fold)"]
+    assert summaries[:3] == [f"{provenance['probes_made']} probes", "3 steps", "cross-validation (2 folds)"]
     assert (
         summaries[3]
         == f"regions with {100 * provenance['mix']['regions']['80%']:.0f} % of the field's gaze contain 80 % "
@@ -116,8 +116,9 @@ def test_without_geometry_folds_select_the_variant(rays):
     assert heard.shares == sorted(heard.shares) and heard.shares[-1] == pytest.approx(1)
     mix = result.provenance["mix"]
     assert set(mix["variants"]) == {"capture", "emit_capture"} and mix["variant"] == result.network.config.variant
-    assert mix["mix"] == pytest.approx((1 - mix["hits_weight"]) * result.network.config.mix)
-    assert (mix["hits_weight"] > 0) == (result.network.hits is not None)
+    hits_weight = sum(weight for weight, *_ in mix["hits"])
+    assert mix["mix"] == pytest.approx((1 - hits_weight) * result.network.config.mix, abs=1e-6)
+    assert (hits_weight > 0) == (result.network.hits is not None)
     order = [text.split(":")[0] for text in heard.texts if "fold" in text or "fit" in text]
     assert list(dict.fromkeys(order))[-1] == "fit" and order[0].startswith("fold 1 of capture")
     assert heard.messages[0].startswith("there is no geometry: cross-validation chooses")

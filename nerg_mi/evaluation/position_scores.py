@@ -1,0 +1,95 @@
+"""Scores of a gaze field where training participants stood and where none did, each against the best baseline."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from scipy.spatial import KDTree
+from scipy.stats import t as student
+
+from nerg_mi.tracking.folds import NEW_POSITION_DISTANCE, sample_participants_equally
+from nerg_mi.tracking.rays import Rays
+
+from .baselines import PRIOR, Baseline
+
+RECORDED, AWAY = "recorded positions", "new positions"
+"""Kinds of positions: up to `NEW_POSITION_DISTANCE` from the nearest training ray, and farther away from all."""
+_MAX_RAYS = 256  # Rays of each kind, with about as many of each participant
+
+
+def score_kinds(
+    train: Rays, held_out: Rays, field: Baseline, tune: Callable[[str], Mapping[str, Baseline]], seed: int = 0
+) -> list[dict[str, Any]]:
+    """Score a field and baselines on ``held_out`` rays at both kinds of positions, each ray at its own origin.
+
+    Parameters
+    ----------
+    train, held_out : Rays
+        Training rays, and rays of others.
+    field : Baseline
+        Density of the gaze field.
+    tune : callable
+        Returns the baselines, with `PRIOR` among them, that are tuned for a kind of positions.
+    seed : int
+        Seed of the drawn rays.
+
+    Returns
+    -------
+    list of dict
+        For each kind with rays, a row per method, the field first and then the baselines from the best on: bits above
+        the prior, averaged over each participant's rays, and the ``bits.gap`` of the field to the baseline. Both have
+        95 % intervals of Student's t over participants, if there are at least three.
+    """
+    rows = []
+    is_new = KDTree(train.origin).query(held_out.origin)[0] > NEW_POSITION_DISTANCE
+    for kind, mask in ((RECORDED, ~is_new), (AWAY, is_new)):
+        if not mask.any():
+            continue
+        rays = sample_participants_equally(held_out.select(mask), _MAX_RAYS, seed)
+        baselines = tune(kind)
+        evaluate = lambda method, rays=rays: _log_bits(method(rays.origin, rays.direction[:, None])[:, 0])
+        prior = evaluate(baselines[PRIOR])
+        gains = {name: evaluate(method) - prior for name, method in {"gaze field": field, **baselines}.items()}
+        people = np.unique(rays.person)
+        by_person = {name: np.array([gain[rays.person == p].mean() for p in people]) for name, gain in gains.items()}
+        ordered = sorted(baselines, key=lambda name: -by_person[name].mean())
+        for name in ("gaze field", *ordered):
+            row = {"kind": kind, "method": name, "rays": len(rays), "people": len(people)}
+            row |= _make_interval("bits", by_person[name])
+            if name in baselines:
+                row |= _make_interval("bits.gap", by_person["gaze field"] - by_person[name])
+            rows.append(row)
+    return rows
+
+
+def find_best(rows: list[dict[str, Any]], kind: str) -> dict[str, Any] | None:
+    """Return the row of the best baseline at a kind of positions; None if there is none."""
+    return next((row for row in rows if row["kind"] == kind and "bits.gap" in row), None)
+
+
+def format_verdicts(rows: list[dict[str, Any]]) -> list[str]:
+    """Return a sentence for each kind of positions with rays."""
+    lines = []
+    for kind in (RECORDED, AWAY):
+        if (best := find_best(rows, kind)) is not None:
+            interval = f" [{best['bits.gap.low']:+.3f}, {best['bits.gap.high']:+.3f}]" if "bits.gap.low" in best else ""
+            lines.append(
+                f"{kind} ({best['people']} participants): {best['bits.gap']:+.3f}{interval} bits per ray over the best "
+                f"baseline, {best['method']}"
+            )
+    return lines
+
+
+def _log_bits(density: np.ndarray) -> np.ndarray:
+    return np.log2(np.maximum(np.asarray(density, np.float64), 0) + np.finfo(float).eps)
+
+
+def _make_interval(name: str, values: np.ndarray) -> dict[str, float]:
+    """Return the mean of ``values`` (N,) of N participants under ``name``, with the ends of its interval."""
+    mean, count = float(values.mean()), len(values)
+    if count < 3:
+        return {name: mean}
+    half_width = float(student.ppf(0.975, count - 1) * values.std(ddof=1) / np.sqrt(count))
+    return {name: mean, f"{name}.low": mean - half_width, f"{name}.high": mean + half_width}

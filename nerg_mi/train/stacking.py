@@ -1,0 +1,69 @@
+"""Stacking: weights of a mixture of densities, fitted to held-out gaze (Wolpert 1992; Smyth and Wolpert 1999).
+
+The weights v maximise Σ_p n/|R_p| Σ_{i in R_p} log Σ_c v_c f_c(i) + Σ_c a_c log v_c, where R_p are the held-out rays of
+participant p, n the number of independent rays that a participant counts as, f_c the densities, and a_c pseudo-rays,
+the parameters of a Dirichlet prior less one. The rays of a participant resemble each other, so that they are worth far
+less than their number; the pseudo-rays keep few participants from deciding.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+_RAYS_PER_PARTICIPANT = 5.0  # Independent rays that a participant counts as
+_NUM_PSEUDO_RAYS = 5.0
+# Fractions of the pseudo-rays; that of the hits is divided between their kernels
+_FIELD, _PRIOR, _HITS = 0.85, 0.10, 0.05
+MAX_KERNELS = 6  # Maximum number of kernels of re-aimed hits in a mixture, because each costs time
+_MIN_WEIGHT = 0.02  # Minimum weight of a kernel, for the same reason
+_MAX_ITERATIONS, _TOLERANCE = 2000, 1e-6
+
+
+def fit_weights(log_densities: np.ndarray, participant: np.ndarray, pseudo_rays: np.ndarray) -> np.ndarray:
+    """Fit the weights (C,) of a mixture of C densities by expectation maximisation.
+
+    Parameters
+    ----------
+    log_densities : array (C, n)
+        Log densities of the components at n held-out rays.
+    participant : array (n,)
+        Participant of each ray, as an integer. Participants have equal weights.
+    pseudo_rays : array (C,)
+        Rays that count as those of each component in addition.
+    """
+    _, index, counts = np.unique(participant, return_inverse=True, return_counts=True)
+    ray_weights = _RAYS_PER_PARTICIPANT / counts[index]
+    relative = np.exp(log_densities - log_densities.max(axis=0))
+    weights = pseudo_rays / pseudo_rays.sum()
+    for _ in range(_MAX_ITERATIONS):
+        before, joint = weights, weights[:, None] * relative
+        weights = pseudo_rays + joint @ (ray_weights / joint.sum(axis=0))
+        weights /= weights.sum()
+        if np.abs(weights - before).max() < _TOLERANCE:
+            break
+    return weights
+
+
+def fit_sparse_weights(log_densities: np.ndarray, participant: np.ndarray) -> np.ndarray:
+    """Fit the weights (2 + K,) of a field, of the prior, and of K kernels of re-aimed hits, in this order; those of all
+    but a few kernels are zero.
+
+    The arguments are those of `fit_weights`.
+    """
+    hits = np.arange(2, len(log_densities))
+    fit = lambda hits: fit_weights(log_densities[[0, 1, *hits]], participant, _make_pseudo_rays(len(hits)))
+    fitted = fit(hits)
+    # One by one, because the weight of a kernel moves to those that resemble it. The largest ones may all be alike.
+    while len(hits) > MAX_KERNELS:
+        hits = np.delete(hits, fitted[2:].argmin())
+        fitted = fit(hits)
+    hits = hits[fitted[2:] >= _MIN_WEIGHT]
+    fitted = fit(hits)
+    weights = np.zeros(len(log_densities))
+    weights[[0, 1, *hits]] = fitted
+    return weights
+
+
+def _make_pseudo_rays(num_kernels: int) -> np.ndarray:
+    fractions = np.array([_FIELD, _PRIOR, *[_HITS / max(num_kernels, 1)] * num_kernels])
+    return _NUM_PSEUDO_RAYS * fractions / fractions.sum()

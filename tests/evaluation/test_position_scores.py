@@ -1,0 +1,68 @@
+"""Tests of `nerg_mi.evaluation.position_scores`."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from nerg_mi.evaluation.baselines import PRIOR
+from nerg_mi.evaluation.position_scores import AWAY, RECORDED, find_best, format_verdicts, score_kinds
+from nerg_mi.tracking.rays import Rays
+
+
+def people(count: int, each: int, x: float) -> Rays:
+    """Participants who stand around ``x`` on the x axis and look along z."""
+    rng, n = np.random.default_rng(int(x) + count), count * each
+    origin = np.column_stack([x + 0.1 * rng.random(n), np.zeros(n), np.full(n, 1.6)])
+    names = tuple(f"p{k}" for k in range(count))
+    return Rays(
+        np.arange(n) * 1.0, np.repeat(np.arange(count), each), names, origin, np.tile([0, 0, 1.0], (n, 1)), np.ones(n)
+    )
+
+
+def constant(density: float):
+    return lambda positions, directions: np.full((len(positions), directions.shape[-2]), density)
+
+
+def test_each_kind_has_baselines_of_its_own():
+    train = people(3, 50, 0.0)
+    near, far = people(4, 40, 0.0), people(4, 40, 2.0)
+    held_out = Rays(
+        np.concatenate([near.t, far.t]),
+        np.concatenate([near.person, far.person]),
+        near.persons,
+        np.concatenate([near.origin, far.origin]),
+        np.concatenate([near.direction, far.direction]),
+        np.ones(320),
+    )
+    # Half as good where nobody stood
+    field = lambda positions, directions: np.where(positions[:, :1] > 1, 0.2, 0.4)
+    tuned = {RECORDED: 0.2, AWAY: 0.1}
+    tune = lambda kind: {PRIOR: constant(0.05), "good": constant(tuned[kind]), "bad": constant(0.01)}
+    rows = score_kinds(train, held_out, field, tune)
+    assert [(row["kind"], row["method"]) for row in rows] == [
+        (kind, name) for kind in (RECORDED, AWAY) for name in ("gaze field", "good", PRIOR, "bad")
+    ]
+    for kind in (RECORDED, AWAY):
+        best = find_best(rows, kind)
+        assert best is not None and best["method"] == "good" and best["people"] == 4 and best["rays"] == 160
+        # Every participant gains as much, so that the interval is empty.
+        assert best["bits.gap"] == best["bits.gap.low"] == best["bits.gap.high"] == pytest.approx(1)
+    assert rows[0]["bits"] == pytest.approx(3) and rows[4]["bits"] == pytest.approx(2)
+    assert [line.split(" (")[0] for line in format_verdicts(rows)] == [RECORDED, AWAY]
+
+
+def test_intervals_are_those_of_participants():
+    train, held_out = people(2, 30, 0.0), people(3, 30, 0.0)
+    # The participants' own densities differ; the origins tell who it is.
+    of_person = {tuple(o): 0.1 * 2.0**p for o, p in zip(held_out.origin, held_out.person)}
+    field = lambda positions, directions: np.array([[of_person[tuple(p)]] for p in positions])
+    rows = score_kinds(train, held_out, field, lambda kind: {PRIOR: constant(0.1)})
+    assert find_best(rows, AWAY) is None and len(rows) == 2
+    assert rows[0]["bits"] == pytest.approx(1)
+    # 0, 1 and 2 bits: a standard error of 1/sqrt(3), times 4.30 of Student's t
+    assert rows[0]["bits.high"] - rows[0]["bits"] == pytest.approx(4.3027 / np.sqrt(3), rel=1e-3)
+    # Two participants have no interval.
+    assert (
+        "bits.low" not in score_kinds(train, people(2, 30, 0.0), constant(0.1), lambda kind: {PRIOR: constant(0.1)})[0]
+    )
