@@ -7,13 +7,11 @@ from dataclasses import dataclass, field, replace
 from types import ModuleType
 from typing import Any, NamedTuple
 
-import drjit as dr
 import numpy as np
 
 from nerg_mi.fields.gaze_hits import MAX_HITS, HitKernel, ReaimedHits, place_missing_points
 from nerg_mi.fields.kde import Backend, SphericalKde, get_default_backend
 from nerg_mi.fields.mlp import namespace
-from nerg_mi.maths.arrays import to_vector
 from nerg_mi.maths.sphere import aim
 from nerg_mi.maths.vmf import log_normaliser
 from nerg_mi.tracking.folds import iter_folds, sample_participants_equally
@@ -352,13 +350,11 @@ def make_tuned_baselines(
 
 def _evaluate_kernels(train: Rays, test: Rays, aims: Sequence[bool]) -> list[np.ndarray]:
     """Evaluate `HIT_KERNELS` of the rays ``train``, and of their hits, at the rays ``test`` (n, K)."""
-    sample, ns = sample_participants_equally(train, MAX_HITS, 0), _get_backend()
-    out = []
+    sample, out = sample_participants_equally(train, MAX_HITS, 0), []
     for is_aimed in aims:
         part = _make_kernels(sample, is_aimed, [1 / len(HIT_KERNELS)] * len(HIT_KERNELS))
         assert part is not None
-        directions, index = to_vector(ns.Array3f, test.direction), dr.arange(ns.UInt32, len(test))
-        out.append(part.observe(test.origin, ns).evaluate_kernels(directions, index))
+        out.append(part.evaluate_kernels(test.origin, test.direction))
     return out
 
 

@@ -22,7 +22,7 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.maths.sphere import aim
-from nerg_mi.maths.types import Float, Point3f, UInt32, Vector3f
+from nerg_mi.maths.types import Float, Point3f, Vector3f
 from nerg_mi.maths.vmf import log_normaliser
 from nerg_mi.ranges import KAPPAS, LENGTHS, MAX_COORDINATE
 
@@ -34,6 +34,7 @@ MAX_KERNELS = 64  # Maximum number of kernels
 # small bandwidth, and of a random subset if more are within _NEIGHBOURHOOD bandwidths.
 MAX_NEIGHBOURS = 1024
 _NEIGHBOURHOOD = 2.5  # Bandwidths
+_BLOCK = 64  # Observers whose kernels are evaluated together
 _NUM_THINNING_CENTRES = 256  # Samples at which neighbours are counted
 FAR = 1e4  # Maximum distance, in bandwidths, at which the point of a sample without a hit is placed
 # Distance from the observer, in bandwidths, below which the direction to a point is that of the recording: the gaze on
@@ -58,6 +59,28 @@ class HitNeighbours(NamedTuple):
     weights: np.ndarray  # (P, k)
     inverse_distance: np.ndarray  # Inverse distance of the hit point (P, k); 0 for a direction of the recording
     offsets: np.ndarray  # From the position to the origin of the sample (P, k, 3)
+
+
+class _NearestSamples(NamedTuple):
+    """The k samples nearest to each of P positions, before they are weighted."""
+
+    distance: np.ndarray  # From the position to the origin of the sample (P, k), nearest first
+    offsets: np.ndarray  # The same as a vector (P, k, 3)
+    to_point: np.ndarray  # From the position to the hit point (P, k, 3)
+    recorded: np.ndarray  # Recorded directions (P, k, 3)
+
+    def weigh(self, bandwidth: float) -> HitNeighbours:
+        # Relative to the nearest sample, so that the weights do not vanish far from all samples.
+        weights = np.exp(0.5 * (self.distance[:, :1] ** 2 - self.distance**2) / bandwidth**2)
+        min_distance = np.float32(_MIN_DISTANCE * bandwidth)
+        directions = aim(self.to_point, self.recorded, np.float32(0), min_distance)
+        weights *= directions.any(axis=-1)
+        # If no sample has a direction, there is nothing to aim at; the density must still be one.
+        is_lost = ~weights.any(axis=1)
+        directions[is_lost, 0], weights[is_lost, 0] = (0, 0, 1), 1
+        length = np.linalg.norm(self.to_point, axis=-1)
+        inverse = np.where(length > min_distance, 1 / np.maximum(length, min_distance), 0)
+        return HitNeighbours(directions, weights.astype(np.float32), inverse, self.offsets)
 
 
 class ReaimedHits:
@@ -136,37 +159,46 @@ class ReaimedHits:
     @cached_property
     def _recorded_directions(self) -> np.ndarray:
         # A point at the observer who looked at it has no direction.
-        return aim(self.points.astype(np.float64), np.zeros(3), self.origins.astype(np.float64), 0.0)
+        offset = self.points.astype(np.float64) - self.origins
+        return aim(offset, np.zeros(3), np.zeros(3), 0.0).astype(np.float32)
 
     def find(self, positions: np.ndarray) -> list[HitNeighbours]:
         """Find the samples nearest to each of ``positions`` (P, 3), in the field's frame, with their weights and
         directions, for each of the kernels."""
         positions = np.asarray(positions, np.float64).reshape(-1, 3)
-        nearest: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        nearest: dict[int, _NearestSamples] = {}
         neighbours: dict[float, HitNeighbours] = {}
         for bandwidth, level in self._levels.items():
             if level not in nearest:
-                subset, tree = self._thinned[level]
-                distance, index = tree.query(positions, k=np.arange(1, min(MAX_NEIGHBOURS, len(subset)) + 1))
-                nearest[level] = distance, subset[index]
-            neighbours[bandwidth] = self._weigh(positions, *nearest[level], bandwidth)
+                nearest[level] = self._find_nearest(positions, level)
+            neighbours[bandwidth] = nearest[level].weigh(bandwidth)
         return [neighbours[kernel.bandwidth] for kernel in self.kernels]
 
-    def _weigh(self, positions: np.ndarray, distance: np.ndarray, index: np.ndarray, bandwidth: float) -> HitNeighbours:
-        """Weigh and aim the samples ``index`` (P, k) at ``distance`` (P, k) from ``positions`` (P, 3)."""
-        # Relative to the nearest sample, so that the weights do not vanish far from all samples.
-        weights = np.exp(0.5 * (distance[:, :1] ** 2 - distance**2) / bandwidth**2)
-        origins, points = self.origins[index].astype(np.float64), self.points[index].astype(np.float64)
-        recorded = self._recorded_directions[index]
-        min_distance = _MIN_DISTANCE * bandwidth
-        directions = aim(points, recorded, positions[:, None], min_distance)
-        weights = np.where(directions.any(axis=-1), weights, 0)
-        # If no sample has a direction, there is nothing to aim at; the density must still be one.
-        is_lost = ~weights.any(axis=1)
-        directions[is_lost, 0], weights[is_lost, 0] = (0, 0, 1), 1
-        length = np.linalg.norm(points - positions[:, None], axis=-1)
-        inverse = np.where(length > min_distance, 1 / np.maximum(length, min_distance), 0)
-        return HitNeighbours(directions, weights, inverse, origins - positions[:, None])
+    def _find_nearest(self, positions: np.ndarray, level: int) -> _NearestSamples:
+        """Find the samples nearest to each of ``positions`` (P, 3) among those of a ``level`` of thinning."""
+        subset, tree = self._thinned[level]
+        distance, index = tree.query(positions, k=np.arange(1, min(MAX_NEIGHBOURS, len(subset)) + 1))
+        index = subset[index]
+        to_point = (self.points[index] - positions[:, None]).astype(np.float32)
+        offsets = (self.origins[index] - positions[:, None]).astype(np.float32)
+        return _NearestSamples(distance, offsets, to_point, self._recorded_directions[index])
+
+    def evaluate_kernels(self, positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Evaluate the density of each of K kernels for the observers at ``positions`` (n, 3) in one unit direction
+        each, ``directions`` (n, 3), in NumPy: (n, K)."""
+        densities = np.empty((len(positions), len(self.kernels)))
+        directions = np.asarray(directions, np.float32)
+        for start in range(0, len(positions), _BLOCK):
+            rows = slice(start, start + _BLOCK)
+            # Kernels of one bandwidth have the same neighbours.
+            distances: dict[float, np.ndarray] = {}
+            for k, (near, (_, bandwidth, kappa)) in enumerate(zip(self.find(positions[rows]), self.kernels)):
+                if bandwidth not in distances:
+                    offset = directions[rows, None] - near.directions
+                    distances[bandwidth] = np.einsum("pkc,pkc->pk", offset, offset)
+                terms = near.weights * np.exp(np.float32(-0.5 * kappa) * distances[bandwidth])
+                densities[rows, k] = np.exp(log_normaliser(kappa)) * terms.sum(axis=1) / near.weights.sum(axis=1)
+        return densities
 
     def mix(self, gaze: Float, density: Float) -> Float:
         """Mix the ``density`` of the hits into the ``gaze`` of the networks."""
@@ -237,11 +269,6 @@ class ObservedHits:
     def evaluate(self, directions: np.ndarray) -> np.ndarray:
         """Densities (P, D) of all P observers in unit ``directions`` (D, 3), or (P, D, 3), float64."""
         return self._add([kde.evaluate(directions).astype(np.float64) for kde in self._kdes])
-
-    def evaluate_kernels(self, r_o: Vector3f, observer: UInt32) -> np.ndarray:
-        """Densities (n, kernels) of each kernel in the directions ``r_o`` for the observers with the indices
-        ``observer``, one direction each."""
-        return np.stack([np.array(kde.density(observer, r_o), np.float64) for kde in self._kdes], axis=1)
 
     def density(self, r_o: Vector3f, p_o: Point3f, observer: Any = None) -> Float:
         """Density (1/sr) in unit directions ``r_o``, in the field's frame, for the observers with the indices

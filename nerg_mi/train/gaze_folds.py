@@ -8,7 +8,6 @@ from dataclasses import asdict, dataclass, replace
 from types import ModuleType
 from typing import Any, NamedTuple
 
-import drjit as dr
 import numpy as np
 
 from nerg_mi.environment.environment import Environment
@@ -219,6 +218,8 @@ PRIOR_WEIGHTS = np.array([0.01, 0.02, *(0.05 * np.arange(1, 21))])
 FOLD_TIME_FRACTION = 0.5  # Fraction of a training's time limit that the folds take
 # Maximum number of held-out rays of a fold, and directions over which the density at their origins is integrated
 _MAX_RAYS, _NUM_DIRECTIONS = 320, 1024
+# Maximum number of rays of a fold at which the re-aimed hits are evaluated in all directions, because that takes long
+_MAX_HIT_MAPS = 64
 _CLEAR_GAIN = 0.1  # Nats per ray
 # Standard errors over participants that are deducted from a gain, with and without surfaces
 _CAUTION, _CAUTION_WITHOUT_SURFACES = 1.0, 2.0
@@ -235,6 +236,8 @@ HIT_KERNELS = tuple(
     for kappa in (10.0, 40.0, 120.0, 300.0, 800.0, 2000.0)
 )
 """Candidate bandwidths (metres) and concentrations of the re-aimed hits."""
+ALL_HIT_KERNELS = tuple(HitKernel(1 / len(HIT_KERNELS), *kernel) for kernel in HIT_KERNELS)
+"""All candidates with equal weights."""
 
 
 _KEYS = {"prior_weight": "mix"}  # Fields with another name in checkpoints
@@ -308,7 +311,7 @@ class PriorSelection:
             return None
         rays = sample_participants_equally(rays, MAX_HITS, plan.settings.seed + 5)
         rays = replace(rays, hit=find_hit_points(rays, geometry, plan.probes.depth))
-        return _make_hits(rays, geometry, self.hits)
+        return make_hits(rays, geometry, self.hits)
 
 
 def selects_prior_weight(plan: GazePlan) -> bool:
@@ -325,8 +328,8 @@ class FoldDensities(NamedTuple):
     densities: np.ndarray
     field_maps: np.ndarray  # Of the field in D directions of equal area (n, D)
     prior_maps: np.ndarray  # Of the prior (n, D)
-    # Maps (n, D) of the density of re-aimed hits with these kernels
-    make_hit_maps: Callable[[Sequence[HitKernel]], np.ndarray]
+    # Maps (m, D) of the density of re-aimed hits with these kernels at the first m rays
+    make_hit_maps: Callable[[Sequence[HitKernel], int], np.ndarray]
     train_fraction: float = 1.0  # Fraction of the rays on which the field was trained
 
 
@@ -511,32 +514,22 @@ def _evaluate_fold(
     columns = [field[:, -1:], prior[:, -1:]]
     train = sample_participants_equally(fold.train, MAX_HITS, seed + 5)
     if plan.settings.reaimed_hits:
-        columns.append(_evaluate_hit_kernels(train, geometry, positions, directions[:, -1], ns))
+        columns.append(make_hits(train, geometry, ALL_HIT_KERNELS).evaluate_kernels(positions, directions[:, -1]))
 
-    def make_hit_maps(kernels: Sequence[HitKernel]) -> np.ndarray:
-        return _make_hits(train, geometry, kernels).observe(positions, ns).evaluate(directions[:, :-1])
+    def make_hit_maps(kernels: Sequence[HitKernel], count: int) -> np.ndarray:
+        return make_hits(train, geometry, kernels).observe(positions[:count], ns).evaluate(directions[:count, :-1])
 
     densities = np.concatenate(columns, axis=1)
     return FoldDensities(test.person, densities, field[:, :-1], prior[:, :-1], make_hit_maps, fold.train_fraction)
 
 
-def _make_hits(rays: Rays, geometry: Environment, kernels: Sequence[HitKernel]) -> ReaimedHits:
+def make_hits(rays: Rays, geometry: Environment, kernels: Sequence[HitKernel]) -> ReaimedHits:
     """Make the re-aimed hits of ``rays`` with hit points, if any; bandwidths of ``kernels`` are in metres."""
     scale = geometry.align.scale
     origins, directions = geometry.points_to_field(rays.origin), geometry.directions_to_field(rays.direction)
     points = None if rays.hit is None else geometry.points_to_field(rays.hit)
     points = place_missing_points(origins, directions, points, scale * max(kernel.bandwidth for kernel in kernels))
     return ReaimedHits(origins, points, [kernel._replace(bandwidth=scale * kernel.bandwidth) for kernel in kernels])
-
-
-def _evaluate_hit_kernels(
-    rays: Rays, geometry: Environment, positions: np.ndarray, directions: np.ndarray, ns: ModuleType
-) -> np.ndarray:
-    """Evaluate the re-aimed hits of ``rays`` with each of `HIT_KERNELS` (n, K) in ``directions`` from ``positions``
-    (n, 3)."""
-    hits = _make_hits(rays, geometry, [HitKernel(1 / len(HIT_KERNELS), *kernel) for kernel in HIT_KERNELS])
-    observed = hits.observe(positions, ns)
-    return observed.evaluate_kernels(to_vector(ns.Array3f, directions), dr.arange(ns.UInt32, len(positions)))
 
 
 def _needs_no_prior(fold: FoldDensities) -> bool:
@@ -556,14 +549,15 @@ def _round_values(value):
 
 
 def _calibrate_regions(folds: Sequence[FoldDensities], selection: PriorSelection) -> dict[str, float]:
-    """Calibrate the region levels of the mixture ``selection`` on the held-out rays of all folds."""
-    levels, hits = [], selection.hits
+    """Calibrate the region levels of the mixture ``selection`` on held-out rays of all folds."""
+    levels = []
     for fold in folds:
         weights = _to_weights(selection, fold)
         maps = weights[0] * fold.field_maps + weights[1] * fold.prior_maps
-        if hits:
-            maps += selection.hits_weight * fold.make_hit_maps(hits)
-        levels.append(compute_region_levels(maps, (fold.densities @ weights)[:, None])[:, 0])
+        if selection.hits:
+            count = min(_MAX_HIT_MAPS, len(maps))
+            maps = maps[:count] + selection.hits_weight * fold.make_hit_maps(selection.hits, count)
+        levels.append(compute_region_levels(maps, (fold.densities[: len(maps)] @ weights)[:, None])[:, 0])
     return calibrate_levels(np.concatenate(levels), np.ones(sum(map(len, levels))))
 
 

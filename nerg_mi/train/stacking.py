@@ -16,10 +16,13 @@ _NUM_PSEUDO_RAYS = 5.0
 _FIELD, _PRIOR, _HITS = 0.85, 0.10, 0.05
 MAX_KERNELS = 6  # Maximum number of kernels of re-aimed hits in a mixture, because each costs time
 _MIN_WEIGHT = 0.02  # Minimum weight of a kernel, for the same reason
+_NEGLIGIBLE_WEIGHT = 0.002  # Weight below which a kernel leaves at once
 _MAX_ITERATIONS, _TOLERANCE = 2000, 1e-6
 
 
-def fit_weights(log_densities: np.ndarray, participant: np.ndarray, pseudo_rays: np.ndarray) -> np.ndarray:
+def fit_weights(
+    log_densities: np.ndarray, participant: np.ndarray, pseudo_rays: np.ndarray, start: np.ndarray | None = None
+) -> np.ndarray:
     """Fit the weights (C,) of a mixture of C densities by expectation maximisation.
 
     Parameters
@@ -30,11 +33,14 @@ def fit_weights(log_densities: np.ndarray, participant: np.ndarray, pseudo_rays:
         Participant of each ray, as an integer. Participants have equal weights.
     pseudo_rays : array (C,)
         Rays that count as those of each component in addition.
+    start : array (C,), optional
+        Positive weights from which to start; None: those of ``pseudo_rays``. The maximum is the same.
     """
     _, index, counts = np.unique(participant, return_inverse=True, return_counts=True)
     ray_weights = _RAYS_PER_PARTICIPANT / counts[index]
     relative = np.exp(log_densities - log_densities.max(axis=0))
-    weights = pseudo_rays / pseudo_rays.sum()
+    weights = pseudo_rays if start is None else start
+    weights = weights / weights.sum()
     for _ in range(_MAX_ITERATIONS):
         before, joint = weights, weights[:, None] * relative
         weights = pseudo_rays + joint @ (ray_weights / joint.sum(axis=0))
@@ -51,16 +57,21 @@ def fit_sparse_weights(log_densities: np.ndarray, participant: np.ndarray) -> np
     The arguments are those of `fit_weights`.
     """
     hits = np.arange(2, len(log_densities))
-    fit = lambda hits: fit_weights(log_densities[[0, 1, *hits]], participant, _make_pseudo_rays(len(hits)))
-    fitted = fit(hits)
-    # One by one, because the weight of a kernel moves to those that resemble it. The largest ones may all be alike.
+
+    def fit(start: np.ndarray | None = None) -> np.ndarray:
+        return fit_weights(log_densities[[0, 1, *hits]], participant, _make_pseudo_rays(len(hits)), start)
+
+    fitted = fit()
+    # One by one, because the weight of a kernel moves to those that resemble it, and the largest ones may all be alike;
+    # kernels that hardly count leave at once.
     while len(hits) > MAX_KERNELS:
-        hits = np.delete(hits, fitted[2:].argmin())
-        fitted = fit(hits)
+        is_kept = fitted[2:] >= min(_NEGLIGIBLE_WEIGHT, np.partition(fitted[2:], -MAX_KERNELS)[-MAX_KERNELS])
+        is_kept[fitted[2:].argmin()] = False
+        hits, start = hits[is_kept], fitted[np.concatenate([[True, True], is_kept])]
+        fitted = fit(start)
     hits = hits[fitted[2:] >= _MIN_WEIGHT]
-    fitted = fit(hits)
     weights = np.zeros(len(log_densities))
-    weights[[0, 1, *hits]] = fitted
+    weights[[0, 1, *hits]] = fit()
     return weights
 
 

@@ -17,6 +17,7 @@ from nerg_mi.tracking.rays import Rays
 from nerg_mi.train.gaze_data import Supervision
 from nerg_mi.train.gaze_ensemble import train_ensemble
 from nerg_mi.train.gaze_folds import (
+    ALL_HIT_KERNELS,
     HIT_KERNELS,
     PRIOR_WEIGHTS,
     SELECTION_KEY,
@@ -24,11 +25,11 @@ from nerg_mi.train.gaze_folds import (
     FoldResults,
     PriorSelection,
     _calibrate_regions,
-    _evaluate_hit_kernels,
     _round_values,
     _select_best,
     _select_weight,
     evaluate_folds,
+    make_hits,
 )
 from nerg_mi.train.gaze_run import KIND, StateSettings, fit_gaze
 from nerg_mi.train.gaze_settings import ProbeSettings
@@ -88,7 +89,7 @@ def plan_of(**changes):
 def make_fold(person, field, prior, field_maps, prior_maps, hits=None, hit_maps=None):
     """Densities of a fold; ``hits`` (n, C) and ``hit_maps`` (n, D) are those of re-aimed hits."""
     densities = np.column_stack([field, prior, *([] if hits is None else [hits])])
-    return FoldDensities(person, densities, field_maps, prior_maps, lambda kernels: hit_maps)
+    return FoldDensities(person, densities, field_maps, prior_maps, lambda kernels, count: hit_maps[:count])
 
 
 def test02_the_best_weight_is_selected_where_the_field_is_clearly_better():
@@ -165,7 +166,7 @@ def test03c_hits_are_seen_from_the_observer():
     positions, directions = rng.uniform(0, 2, (7, 3)), fibonacci_directions(7)
     for hit in (None, rays.origin + 3 * rays.direction):
         rays = replace(rays, hit=hit)
-        columns = _evaluate_hit_kernels(rays, NOWHERE, positions, directions, ns)
+        columns = make_hits(rays, NOWHERE, ALL_HIT_KERNELS).evaluate_kernels(positions, directions)
         far = rays.origin + FAR * max(bandwidth for bandwidth, _ in HIT_KERNELS) * rays.direction
         for column, (bandwidth, kappa) in zip(columns.T, HIT_KERNELS):
             points = far if hit is None else hit
