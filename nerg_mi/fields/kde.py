@@ -360,9 +360,9 @@ class SphericalKde:
 # One kernel density tabulated over the sphere, practically exact for pictures and independent of the number of
 # directions.
 #
-# A kernel density is smooth on the scale 1/sqrt(κ). It is evaluated exactly at the texels of a cube map with a spacing
-# of a fraction of that scale, and interpolated cubically in between: a lookup reads sixteen values, however many rays
-# the probe holds.
+# A kernel density is smooth on the scale 1/sqrt(κ). It is evaluated at the texels of a cube map with a spacing of a
+# fraction of that scale, as the sum of the kernels that are not negligible there, and interpolated cubically in
+# between: a lookup reads sixteen values, however many rays the probe holds.
 
 TEXEL_SPACING = 0.15
 """Distance of the texels in units of 1/sqrt(κ). The error of cubic interpolation scales with its fourth power; at 0.15
@@ -370,6 +370,8 @@ it is below 1e-4 of the maximum of a single kernel (measured in the tests).
 """
 _PADDING = 2  # Padding of a face in texels, so that the interpolation never crosses faces
 _MAX_RESOLUTION = 4096
+_NEGLIGIBLE_EXPONENT = 11.0  # Kernels are neglected below 2e-5 of their maximum
+_MAX_CELLS = 128  # Maximum number of cells along an axis
 
 
 class SphericalKdeTable:
@@ -381,8 +383,6 @@ class SphericalKdeTable:
         Kernel densities.
     probe : int
         Index of the probe.
-    directions : numpy.ndarray, optional
-        Directions (N, 3) of all later lookups, if known. Other texels are not evaluated, and lookups there are wrong.
     spacing : float
         Distance of the texels in units of 1/sqrt(κ).
 
@@ -396,9 +396,7 @@ class SphericalKdeTable:
     A face of the cube is divided into equal angles, u = (4/π) atan(x/z).
     """
 
-    def __init__(
-        self, kde: SphericalKde, probe: int = 0, directions: np.ndarray | None = None, spacing: float = TEXEL_SPACING
-    ) -> None:
+    def __init__(self, kde: SphericalKde, probe: int = 0, spacing: float = TEXEL_SPACING) -> None:
         self.ns = ns = kde.ns
         kappa = float(kde.kappa[probe])
         self.resolution = n = _count_texels(kappa, spacing)
@@ -406,39 +404,20 @@ class SphericalKdeTable:
             raise ValueError(
                 f"κ = {kappa:.3g} needs {6 * n * n:,} texels; evaluate the density directly (SphericalKde.evaluate)"
             )
-        self.padded_resolution = n + 2 * _PADDING
-        is_needed = (
-            np.ones((6, self.padded_resolution, self.padded_resolution), bool)
-            if directions is None
-            else self._find_texels(directions)
-        )
-        at = np.flatnonzero(is_needed.ravel())
-        face, row = np.divmod(at, self.padded_resolution * self.padded_resolution)
-        j, i = np.divmod(row, self.padded_resolution)
-        angle = lambda k: np.tan(0.25 * math.pi * ((k - _PADDING + 0.5) * 2.0 / n - 1.0))
-        values = np.zeros(is_needed.size, np.float32)
-        values[at] = kde.select_range(probe, probe + 1).evaluate(_face_directions(face, angle(i), angle(j)))[0]
-        self.num_evaluated = len(at)
-        self._values = ns.Float(values)
+        self.padded_resolution = width = n + 2 * _PADDING
+        texel = dr.arange(ns.UInt32, 6 * width * width)
+        row, column = (texel // width) % width, texel % width
+        centres = ns.Float(np.tan(0.25 * math.pi * ((np.arange(width) - _PADDING + 0.5) * 2 / n - 1)))
+        u, v = (dr.gather(ns.Float, centres, k) for k in (column, row))
+        direction = ns.Array3f(*_to_direction(texel // (width * width), u, v))
+        self._values = _sum_near_rays(kde.select_range(probe, probe + 1), direction)
+        dr.eval(self._values)
 
     @staticmethod
     def is_worthwhile(kde: SphericalKde, count: int) -> bool:
         """Return whether a table of the first probe is at most as dense as ``count`` directions over the sphere."""
         n = _count_texels(float(kde.kappa[0]), TEXEL_SPACING)
         return n <= _MAX_RESOLUTION and 6 * n * n <= 16 * count
-
-    def _find_texels(self, directions: np.ndarray) -> np.ndarray:
-        """Return the texels (6, width, width) that lookups in ``directions`` read."""
-        ns = self.ns
-        hit = dr.zeros(ns.UInt32, 6 * self.padded_resolution * self.padded_resolution)
-        first = self._locate(to_vector(ns.Array3f, directions.reshape(-1, 3)))[0]
-        dr.scatter(hit, ns.UInt32(1), first)
-        corner = np.array(hit).reshape(6, self.padded_resolution, self.padded_resolution) > 0
-        out = corner.copy()
-        for dj in range(4):
-            for di in range(4):
-                out[:, dj:, di:] |= corner[:, : self.padded_resolution - dj, : self.padded_resolution - di]
-        return out
 
     def _locate(self, d: Array3f) -> tuple[UInt32, list[Float]]:
         """Return the index of the first of a lookup's 4 x 4 texels, and the position between the middle ones in [0,
@@ -488,12 +467,47 @@ def _cubic_weights(t: Float) -> tuple[Float, Float, Float, Float]:
     return -t * b * c / 6, a * b * c / 2, -a * t * c / 2, a * t * b / 6
 
 
-def _face_directions(face: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Return the unit directions (N, 3) of positions on the cube faces +x, -x, +y, -y, +z, -z."""
-    out = np.empty((len(face), 3))
-    axis = face // 2
-    n = np.arange(len(face))
-    out[n, axis] = np.where(face % 2, -1.0, 1.0)
-    out[n, np.where(axis == 0, 1, 0)] = u
-    out[n, np.where(axis == 2, 1, 2)] = v
-    return out / np.linalg.norm(out, axis=1, keepdims=True)
+def _to_direction(face: UInt32, u: Float, v: Float) -> tuple[Float, Float, Float]:
+    """Return the unit directions of positions on the cube faces +x, -x, +y, -y, +z, -z."""
+    sign = 1 - 2 * type(u)(face & 1)
+    on_x, on_z = face < 2, face >= 4
+    x = dr.select(on_x, sign, u)
+    y = dr.select(on_x, u, dr.select(on_z, v, sign))
+    z = dr.select(on_z, sign, v)
+    length = dr.sqrt(x * x + y * y + z * z)
+    return x / length, y / length, z / length
+
+
+def _sum_near_rays(kde: SphericalKde, direction: Array3f) -> Float:
+    """Evaluate the density of a single probe in each of the unit directions ``direction``, without rays whose kernels
+    are negligible there.
+
+    The rays are sorted into cubic cells whose edge is the distance beyond which a kernel is negligible. A direction
+    needs those of its cell and of the adjacent ones: nine runs, since the cells of a row follow each other.
+    """
+    ns, kappa = kde.ns, float(kde.kappa[0])
+    count = int(np.clip(2.0 / math.sqrt(2.0 * _NEGLIGIBLE_EXPONENT / max(kappa, 1e-6)), 1, _MAX_CELLS))
+    packed = np.array(kde._rays).reshape(-1, 4)
+    cell = np.clip((packed[:, :3] + 1) * (0.5 * count), 0, count - 1).astype(np.int64) @ (1, count, count * count)
+    order = np.argsort(cell, kind="stable")
+    rays = SphericalKde(packed[order, :3], [0, len(packed)], kappa, packed[order, 3], ns)
+    starts = ns.UInt32(np.searchsorted(cell[order], np.arange(count**3 + 1)).astype(np.uint32))
+    x, y, z = (ns.UInt32(dr.clip((w + 1) * (0.5 * count), 0, count - 1)) for w in direction)
+    left, right = dr.maximum(x, 1) - 1, dr.minimum(x + 2, count)
+    zero = dr.zeros(ns.Float, dr.width(direction))
+
+    def add(ray, total, direction):
+        offset = direction - ns.Array3f(ray.x, ray.y, ray.z)
+        return [dr.fma(ray.w, dr.exp(-0.5 * kappa * dr.squared_norm(offset)), total[0])]
+
+    def add_run(k, total, direction, y, z, left, right):
+        row, layer = y + k % 3, z + k // 3  # One more than their index
+        is_inside = (row >= 1) & (row <= count) & (layer >= 1) & (layer <= count)
+        base = ((layer - 1) * count + row - 1) * count
+        first, last = (dr.gather(ns.UInt32, starts, base + end, is_inside) for end in (left, right))
+        (part,) = rays._sum_rays(first, last, [zero], add, direction)
+        return k + 1, total + part, direction, y, z, left, right
+
+    state = dr.zeros(ns.UInt32, dr.width(direction)), zero, direction, y, z, left, right
+    total = dr.while_loop(state, lambda k, *_: k < 9, add_run, label="near rays")[1]
+    return total * float(np.exp(log_normaliser(kappa)))

@@ -152,14 +152,6 @@ def test_close_to_exact_everywhere(kappa, count):
     assert table.evaluate(fibonacci_directions(8192)).min() >= 0
 
 
-def test_only_requested_texels_are_evaluated():
-    rng = np.random.default_rng(1)
-    kde = SphericalKde(sample_uniform_directions(30, rng), [0, 30], 60.0, backend="llvm")
-    x = vmf.sample(np.tile([0.6, 0.0, 0.8], (2000, 1)), 100.0, rng)
-    part, full = SphericalKdeTable(kde, directions=x), SphericalKdeTable(kde)
-    assert np.array_equal(part.evaluate(x), full.evaluate(x)) and part.num_evaluated < 0.2 * full.num_evaluated
-
-
 def test_one_probe_of_several_and_its_slope():
     import drjit.llvm.ad as ns
 

@@ -126,7 +126,7 @@ def test_only_the_nearest_samples_count():
     near = ReaimedHits(origins, points, [HitKernel(0.5, 0.4, 50.0)]).find(np.zeros((2, 3)))[0]
     assert near.directions.shape == (2, MAX_NEIGHBOURS, 3) and near.weights.max() == 1
     square = np.sort((origins.astype(np.float32).astype(float) ** 2).sum(axis=1))[:MAX_NEIGHBOURS]
-    np.testing.assert_allclose((near.offsets[0] ** 2).sum(axis=1), square)
+    np.testing.assert_allclose((near.offsets[0] ** 2).sum(axis=1), square, rtol=1e-5)
 
 
 def test_gradients_equal_finite_differences():
