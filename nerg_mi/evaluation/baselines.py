@@ -53,7 +53,7 @@ DEFAULT_SETTINGS: Mapping[str, Mapping[str, float]] = {
 # Of the stack: pseudo-rays of the prior, and of all kernels together, and the minimum weight of a kernel
 _PRIOR_PSEUDO_RAYS, _KERNEL_PSEUDO_RAYS, _MIN_KERNEL_WEIGHT = 5.0, 10.0, 0.01
 _FOLDS = 4  # Folds of the training rays
-_MAX_TEST_RAYS = 400  # Held-out rays of a fold
+_MAX_TEST_RAYS = 256  # Held-out rays of a fold
 MIN_AIM_DISTANCE = 0.15  # Metres below which the direction to a hit point is not used: the recorded one is
 _MIN_DENSITY = 1e-9  # 1/sr, so that logarithms are finite
 _BLOCK = 32  # Positions that are evaluated together

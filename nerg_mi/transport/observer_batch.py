@@ -36,7 +36,7 @@ RAYS_PER_LAUNCH = 1 << 18
 """Rays per kernel launch."""
 
 _OBSERVERS_PER_BLOCK = 256
-"""Observers whose depths for escaped rays are held at the same time, 128 KiB each."""
+"""Observers whose depths for escaped rays are held at the same time, 32 KiB each."""
 
 
 @dataclass(frozen=True)

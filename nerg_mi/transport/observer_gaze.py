@@ -108,7 +108,7 @@ def sum_sphere(values: np.ndarray) -> SphereIntegral:
 #
 # The surfaces around an observer in all directions, over which a gaze field is integrated.
 
-MISS_DIRECTIONS = 1 << 14
+MISS_DIRECTIONS = 1 << 11
 """Directions whose depths replace those of rays that escape. A fixed number: depths taken from an integral's own
 directions would make the integral depend on their number, by several per cent where half of the rays escape."""
 
