@@ -72,8 +72,8 @@ class _NearestSamples(NamedTuple):
     def weigh(self, bandwidth: float) -> HitNeighbours:
         # Relative to the nearest sample, so that the weights do not vanish far from all samples.
         weights = np.exp(0.5 * (self.distance[:, :1] ** 2 - self.distance**2) / bandwidth**2)
-        min_distance = np.float32(_MIN_DISTANCE * bandwidth)
-        directions = aim(self.to_point, self.recorded, np.float32(0), min_distance)
+        min_distance = _MIN_DISTANCE * bandwidth
+        directions = aim(self.to_point, self.recorded, np.zeros(3, np.float32), min_distance)
         weights *= directions.any(axis=-1)
         # If no sample has a direction, there is nothing to aim at; the density must still be one.
         is_lost = ~weights.any(axis=1)

@@ -490,7 +490,7 @@ def _sum_near_rays(kde: SphericalKde, direction: Array3f) -> Float:
     packed = np.array(kde._rays).reshape(-1, 4)
     cell = np.clip((packed[:, :3] + 1) * (0.5 * count), 0, count - 1).astype(np.int64) @ (1, count, count * count)
     order = np.argsort(cell, kind="stable")
-    rays = SphericalKde(packed[order, :3], [0, len(packed)], kappa, packed[order, 3], ns)
+    rays = SphericalKde(packed[order, :3], np.array([0, len(packed)]), kappa, packed[order, 3], ns)
     starts = ns.UInt32(np.searchsorted(cell[order], np.arange(count**3 + 1)).astype(np.uint32))
     x, y, z = (ns.UInt32(dr.clip((w + 1) * (0.5 * count), 0, count - 1)) for w in direction)
     left, right = dr.maximum(x, 1) - 1, dr.minimum(x + 2, count)
