@@ -135,8 +135,8 @@ def _read_vectors(reader: DataFrameReader, names: Sequence[Any]) -> np.ndarray:
     texts = [cell if isinstance(cell, str) else "" for cell in cells]
     out, is_bad = parse_vectors(texts, 3)
     for k, cell in enumerate(cells):
-        if isinstance(cell, Mapping) and set(cell) == set("xyz"):
-            cell = [cell[axis] for axis in "xyz"]
+        if isinstance(cell, Mapping) and sorted(str(axis).lower() for axis in cell) == list("xyz"):
+            cell = [value for _, value in sorted(cell.items(), key=lambda item: str(item[0]).lower())]
         if not isinstance(cell, (str, Mapping)) and np.ndim(cell) == 1 and len(cell) == 3:
             out[k] = to_numbers(cell, column)
         elif not (isinstance(cell, str) or is_missing(cell)):

@@ -255,13 +255,14 @@ def test_repeated_columns_of_data_frames():
 
 
 @pytest.mark.parametrize("library", ["pandas", "polars", "pyarrow"])
-@pytest.mark.parametrize("kind", ["list", "mapping", "text"])
+@pytest.mark.parametrize("kind", ["list", "mapping", "capitals", "text"])
 def test_vectors_in_one_column(library, kind):
     pytest.importorskip(library)
     origins, directions, times, _ = arrays(5)
     cells = {
         "list": origins.tolist(),
         "mapping": [dict(zip("xyz", v)) for v in origins.tolist()],
+        "capitals": [dict(zip("ZXY", (v[2], *v[:2]))) for v in origins.tolist()],
         "text": [f"({', '.join(map(repr, v))})" for v in origins.tolist()],
     }[kind]
     table = make_dataframe({"time": times, "o": [*cells[:4], None], "d": directions.tolist()}, library)
