@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 from nerg_mi.fields.radiance import density_from_log
-from nerg_mi.transport.depth import find_surface_depth
+from nerg_mi.transport.depth import DEPTHS, MarchContext
 from nerg_mi.transport.march import march
 from nerg_mi.transport.march_primal import MarchSettings
 from nerg_mi.transport.medium import LocalRay
@@ -480,7 +480,7 @@ def all_opacities(mi):
     alpha = -np.expm1(-x64)
     truth = {"expected": share(x64), "median": -np.log1p(-alpha / 2) / x64, "refined": -np.log1p(-alpha / 2) / x64}
     for kind, expected in truth.items():
-        got = find_surface_depth(kind, r, medium, ray, mi.Float(0), mi.Float(1), mi.Mask(True), settings)
+        got = DEPTHS.find(kind).inside(MarchContext(r, medium, ray, mi.Float(0), mi.Float(1), mi.Mask(True), settings))
         yield Row(
             "depth at any opacity" if kind == "expected" else "",
             "1e-6 .. 1" if kind == "expected" else "",

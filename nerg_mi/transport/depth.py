@@ -34,7 +34,7 @@ class MarchContext:
     active: Bool
     settings: MarchSettings
     # Rays that end on an opaque shape, so that their own opacity is 1; None without such rays.
-    backed: Bool | None = None
+    ends_opaque: Bool | None = None
 
 
 class DensityProfile(Protocol):
@@ -198,7 +198,7 @@ class _Half:
     """Where half of each ray's opacity is reached: ``depth``, and the masks of both cases."""
 
     def __init__(self, context: MarchContext):
-        result, settings, active, ends_opaque = context.result, context.settings, context.active, context.backed
+        result, settings, active, ends_opaque = context.result, context.settings, context.active, context.ends_opaque
         opaque = result.tau >= settings.max_optical_depth
         alpha = result.opacity
         remaining = active & (alpha > 0)
@@ -223,21 +223,6 @@ class _Half:
 
 for _depth in (Expected(), Median(), RefinedMedian()):
     DEPTHS.register(_depth)
-
-
-def find_surface_depth(
-    kind: str,
-    result: MarchResult,
-    medium: Medium,
-    ray: LocalRay,
-    t0: Float,
-    t1: Float,
-    active: Bool,
-    settings: MarchSettings,
-    ends_opaque: Bool | None = None,
-) -> Float:
-    """Depth of ``kind`` (a name in ``DEPTHS``) from the result of a march: `DepthKind.inside`."""
-    return DEPTHS.find(kind).inside(MarchContext(result, medium, ray, t0, t1, active, settings, ends_opaque))
 
 
 def penetration_depth(kind: str, result: MarchResult, depth: Float) -> Float:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, cast
 
@@ -18,7 +18,7 @@ from nerg_mi.fields.mlp import namespace
 from nerg_mi.maths.coordinates import check_coordinates
 from nerg_mi.maths.types import Bool, Color, Float, Point3f, Ray3f, Vector3f, variant_types
 
-from .depth import DEPTHS, find_surface_depth, penetration_depth
+from .depth import DEPTHS, MarchContext, penetration_depth
 from .jit import is_recording
 from .march import march_with_prepass
 from .march_primal import MarchResult, MarchSettings, default_color_cutoff, default_dt_gamma, default_step, default_stop
@@ -137,8 +137,8 @@ class SceneRay:
 class RayHit:
     """The result of tracing a ray. Attached to whatever carries gradients."""
 
-    # March through the medium; None without a medium.
-    march: MarchResult | None
+    # March through the medium; None without a medium. Its ``ends_opaque`` is None without shapes.
+    context: MarchContext | None
     # Whether a shape ends the ray, and its distance in scene units, infinite without one.
     hits_shape: Bool
     shape_distance: Float
@@ -148,13 +148,25 @@ class RayHit:
     medium_opacity: Float
     # Mitsuba's preliminary intersection; None without shapes.
     shape_intersection: Any
-    # The implementation of `depth`.
-    depth_function: Callable[[str, Bool], Float]
+
+    @property
+    def march(self) -> MarchResult | None:
+        """The result of the march; None without a medium."""
+        return None if self.context is None else self.context.result
 
     def depth(self, kind: str, active: Bool) -> Float:
         """Depth of ``kind`` (a name in `depth.DEPTHS`) in scene units from the origin of the ray; 0 without
         absorption."""
-        return self.depth_function(kind, active)
+        context, hit, distance = self.context, self.hits_shape, self.shape_distance
+        if context is None:
+            return dr.select(active & hit, distance, 0)
+        find = DEPTHS.find(kind)
+        if context.ends_opaque is None:
+            return find.inside(replace(context, active=active))
+        some = active & (self.medium_opacity > 0)
+        inside = find.inside(replace(context, active=some))
+        through = find.combine_with_shape(context.result, self.medium_opacity, inside, hit, distance)
+        return dr.select(active & hit, through, dr.select(some, inside, 0))
 
     def has_surface(self, surface_opacity: float) -> Bool:
         """Whether there is a surface: a positive opacity of at least ``surface_opacity``, which may be 0."""
@@ -241,26 +253,16 @@ class SceneGeometry:
             hit = active & (distance < end)
             distance = dr.select(hit, distance, dr.inf)
         if self.medium is None:
-            opacity = dr.select(hit, Float(1), 0)
-            at_shape = lambda kind, active: dr.select(active & hit, distance, 0)
-            return RayHit(None, hit, distance, opacity, Float(0), preliminary, at_shape)
+            return RayHit(None, hit, distance, dr.select(hit, Float(1), 0), Float(0), preliminary)
 
         medium = self.medium
         local = medium.ray_to_local(ray.o, ray.d)
         t0, t1 = dr.maximum(local.t_near, 0), dr.minimum(dr.minimum(local.t_far, end), distance)
         result = march_with_prepass(medium, local, t0, t1, active, settings, **options)
-        front = result.opacity
-        if self.scene is None:
-            in_medium = lambda kind, active: find_surface_depth(kind, result, medium, local, t0, t1, active, settings)
-            return RayHit(result, hit, distance, front, front, None, in_medium)
-
-        def in_both(kind, active):
-            some = active & (front > 0)
-            inside = find_surface_depth(kind, result, medium, local, t0, t1, some, settings, ends_opaque=hit)
-            through = DEPTHS.find(kind).combine_with_shape(result, front, inside, hit, distance)
-            return dr.select(active & hit, through, dr.select(some, inside, 0))
-
-        return RayHit(result, hit, distance, dr.select(hit, 1, front), front, preliminary, in_both)
+        front, ends_opaque = result.opacity, None if self.scene is None else hit
+        context = MarchContext(result, medium, local, t0, t1, active, settings, ends_opaque)
+        opacity = front if self.scene is None else dr.select(hit, 1, front)
+        return RayHit(context, hit, distance, opacity, front, preliminary)
 
 
 def as_scene_geometry(subject: Medium | SceneGeometry) -> SceneGeometry:

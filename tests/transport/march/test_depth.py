@@ -8,7 +8,7 @@ import pytest
 
 from nerg_mi.evaluation import study
 from nerg_mi.evaluation.study_subject import open_subject
-from nerg_mi.transport.depth import DEPTHS, Expected, find_surface_depth, penetration_depth
+from nerg_mi.transport.depth import DEPTHS, Expected, MarchContext, penetration_depth
 from nerg_mi.transport.geometry import trace_depth
 from nerg_mi.transport.march import march
 from nerg_mi.transport.march_primal import MarchSettings
@@ -25,7 +25,7 @@ def depth(mi, medium, kind, settings, o=(0.5, 0.5, 0), d=(0, 0, 1)):
     ray = medium.ray_to_local(mi.Point3f(o.T), mi.Vector3f(d.T))
     t0, t1, active = dr.maximum(ray.t_near, 0), ray.t_far, mi.Bool(True)
     result = march(medium, ray, t0, t1, active, settings)
-    return find_surface_depth(kind, result, medium, ray, t0, t1, active, settings).numpy()
+    return DEPTHS.find(kind).inside(MarchContext(result, medium, ray, t0, t1, active, settings)).numpy()
 
 
 def slab(mi, sigma, near=1.0):
@@ -92,7 +92,9 @@ def test05_median_gradient_equals_central_differences(rgb):
             ray = medium.ray_to_local(rgb.Point3f(0.5, 0.5, -1), rgb.Vector3f(0, 0, 1))
             settings = MarchSettings(1 / 32)
             result = march(medium, ray, ray.t_near, ray.t_far, True, settings)
-            d = find_surface_depth(kind, result, medium, ray, ray.t_near, ray.t_far, rgb.Bool(True), settings)
+            d = DEPTHS.find(kind).inside(
+                MarchContext(result, medium, ray, ray.t_near, ray.t_far, rgb.Bool(True), settings)
+            )
             dr.set_grad(s, 0)
             dr.backward(d, dr.ADFlag.ClearInterior)
             h = 1e-5 * sigma
@@ -107,7 +109,9 @@ def test06_penetration_depth_of_thick_and_thin_matter(rgb, kind):
         medium = slab(rgb, sigma, near)
         ray = medium.ray_to_local(rgb.Point3f(0.5, 0.5, 0), rgb.Vector3f(0, 0, 1))
         result = march(medium, ray, ray.t_near, ray.t_far, True, MarchSettings(1 / 64))
-        d = find_surface_depth(kind, result, medium, ray, ray.t_near, ray.t_far, rgb.Bool(True), MarchSettings(1 / 64))
+        d = DEPTHS.find(kind).inside(
+            MarchContext(result, medium, ray, ray.t_near, ray.t_far, rgb.Bool(True), MarchSettings(1 / 64))
+        )
         out, d = penetration_depth(kind, result, d).numpy()[0], d.numpy()[0]
         if sigma >= 200:
             assert abs(d - out - near) < 1e-5
@@ -124,7 +128,7 @@ def test07_evaluations_of_depth_search_are_added(rgb, sigma):
     for kind in DEPTHS.names():
         result = march(medium, ray, ray.t_near, ray.t_far, True, settings, count=True)
         first = result.density_evals[0]
-        find_surface_depth(kind, result, medium, ray, ray.t_near, ray.t_far, rgb.Bool(True), settings)
+        DEPTHS.find(kind).inside(MarchContext(result, medium, ray, ray.t_near, ray.t_far, rgb.Bool(True), settings))
         counts[kind] = result.density_evals[0] - first
     # Thin matter is marched again up to half of its own opacity; a refined depth takes at most sixteen steps inside
     # one.
@@ -157,7 +161,9 @@ def test09_inactive_lanes_have_no_depth(rgb, kind):
     ray = medium.ray_to_local(rgb.Point3f(0.5, 0.5, 0), rgb.Vector3f(0, 0, 1))
     result = march(medium, ray, ray.t_near, ray.t_far, True, settings)
     requested = rgb.Bool([True, False])
-    results = find_surface_depth(kind, result, medium, ray, ray.t_near, ray.t_far, requested, settings).numpy()
+    results = (
+        DEPTHS.find(kind).inside(MarchContext(result, medium, ray, ray.t_near, ray.t_far, requested, settings)).numpy()
+    )
     assert results[0] > 1 and results[1] == 0
 
 

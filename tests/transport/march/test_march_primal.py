@@ -13,7 +13,7 @@ from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.occupancy import OccupancyGrid
 from nerg_mi.fields.radiance import RadianceConfig, RadianceNetwork
 from nerg_mi.maths.geometry import Box
-from nerg_mi.transport.depth import find_surface_depth, penetration_depth
+from nerg_mi.transport.depth import DEPTHS, MarchContext, penetration_depth
 from nerg_mi.transport.field_medium import FieldMedium
 from nerg_mi.transport.geometry import SceneGeometry
 from nerg_mi.transport.march import march
@@ -49,7 +49,7 @@ def marched(mi, medium, o, d, t1=np.inf, kinds=("expected", "median", "refined")
     ray = medium.ray_to_local(mi.Point3f(np.atleast_2d(o).T), mi.Vector3f(np.atleast_2d(d).T))
     t0, t1, active = dr.maximum(ray.t_near, 0), dr.minimum(ray.t_far, t1), mi.Bool(True)
     result = march(medium, ray, t0, t1, active, SETTINGS, **options)
-    depths = [find_surface_depth(k, result, medium, ray, t0, t1, active, SETTINGS).numpy() for k in kinds]
+    depths = [DEPTHS.find(k).inside(MarchContext(result, medium, ray, t0, t1, active, SETTINGS)).numpy() for k in kinds]
     return result, depths
 
 

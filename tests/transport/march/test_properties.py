@@ -9,7 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from nerg_mi.transport.depth import DEPTHS, find_surface_depth
+from nerg_mi.transport.depth import DEPTHS, MarchContext
 from nerg_mi.transport.march import march
 from nerg_mi.transport.march_primal import MarchSettings
 from nerg_mi.transport.medium import ColorShader, LocalRay
@@ -96,7 +96,9 @@ def test01_march_matches_float64_reference(rgb, table):
     assert np.isclose(one(r.opacity), opacity, rtol=2e-6)
     if opacity > 0:
         assert np.isclose(one(r.expected_depth), expected, rtol=2e-6, atol=1e-12)
-        result = find_surface_depth("median", r, pieces(rgb, table), ray, ray.t_near, ray.t_far, True, WHOLE)
+        result = DEPTHS.find("median").inside(
+            MarchContext(r, pieces(rgb, table), ray, ray.t_near, ray.t_far, True, WHOLE)
+        )
         # With almost no absorption behind the median, rounding of the optical depth moves it.
         tau = lambda t: np.interp(
             t, np.linspace(0, 1, PIECES + 1), np.concatenate([[0], np.cumsum(table.astype(float) / PIECES)])
@@ -159,7 +161,7 @@ def test07_depth_lies_in_the_box(rgb, table, kind, quadrature, stop):
     controls = MarchSettings(1 / 20, stop=stop, quadrature=quadrature)
     medium = pieces(rgb, table)
     ray, r = through(rgb, medium, controls)
-    depth = one(find_surface_depth(kind, r, medium, ray, ray.t_near, ray.t_far, True, controls))
+    depth = one(DEPTHS.find(kind).inside(MarchContext(r, medium, ray, ray.t_near, ray.t_far, True, controls)))
     assert 0 <= depth <= 1 + 1e-6
     assert depth == 0 if not table.any() else True
 
@@ -232,7 +234,7 @@ def test10_second_order_in_smooth_densities(rgb, quadrature):
         medium = Along(rgb, lambda z: smooth(z, dr.exp, dr.sin))
         controls = MarchSettings(1 / n, stop=0, quadrature=quadrature)
         ray, r = through(rgb, medium, controls)
-        median = find_surface_depth("median", r, medium, ray, ray.t_near, ray.t_far, True, controls)
+        median = DEPTHS.find("median").inside(MarchContext(r, medium, ray, ray.t_near, ray.t_far, True, controls))
         errors.append(np.abs(np.array([one(r.tau), one(r.expected_depth), one(median)]) - want))
     orders = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
     # Optical depth and expected depth converge with the expected order at each halving. The median varies within its
