@@ -214,7 +214,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -558,33 +557,14 @@ class NergIntegrator(mi.SamplingIntegrator):
 
     def context(self) -> RenderContext:
         """The context of a rendering with the integrator's own AOVs."""
-        return RenderContext(
-            aovs=self.aovs,
-            required_data=self.required_data,
-            views=self.views,
-            radiance=self.radiance,
-            medium=self.medium,
-            gaze=self.gaze,
-            shading=self.shading,
-            observer=self.observer,
-            cache=self.cache,
-            occlusion=self.occlusion,
-            falloff=self.falloff,
-            settings=self.settings,
-            observer_settings=self.observer_settings,
-            ceiling=self.ceiling,
-            background=self.background,
-            hide_emitters=self.hide_emitters,
-            jitter=self.jitter,
-        )
+        return RenderContext(self, self.aovs, self.required_data, self.views, self.radiance)
 
     def make_context(self, aovs: Sequence[str], radiance: bool) -> RenderContext:
         """The context of a rendering with other AOVs, with or without colour. Raises ``NergError`` for AOVs that cannot
         be computed."""
         names = nerg_aovs.parse_aovs(",".join(aovs), self)
         views = nerg_aovs.collect_observer_views(names, self)
-        required_data = nerg_aovs.collect_required_data(names)
-        return replace(self.context(), aovs=names, required_data=required_data, views=views, radiance=radiance)
+        return RenderContext(self, names, nerg_aovs.collect_required_data(names), views, radiance)
 
     @property
     def children(self):

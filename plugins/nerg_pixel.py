@@ -17,11 +17,11 @@ from nerg_mi.maths.types import Bool, Color, Float, Point3f, Ray3f, Vector3f
 from nerg_mi.transport import aovs as nerg_aovs
 from nerg_mi.transport import observer
 from nerg_mi.transport.field_medium import FeatureShader, make_color_shader
-from nerg_mi.transport.geometry import Ceiling, SceneGeometry, Shading
+from nerg_mi.transport.geometry import SceneGeometry
 from nerg_mi.transport.jit import is_recording
-from nerg_mi.transport.march_primal import MarchResult, MarchSettings
-from nerg_mi.transport.medium import Medium, SampleShader
-from nerg_mi.transport.observer import ObserverCache, ObserverSettings, ObserverView, evaluate_view
+from nerg_mi.transport.march_primal import MarchResult
+from nerg_mi.transport.medium import SampleShader
+from nerg_mi.transport.observer import ObserverCache, ObserverView, evaluate_view
 from nerg_mi.transport.observer_gaze import GazeFieldInstance, ObservedGaze
 from nerg_mi.transport.occlusion import ObserverHit, trace_from_observer
 from nerg_mi.transport.splat_medium import SplatMedium
@@ -30,9 +30,9 @@ from nerg_mi.transport.splat_medium import SplatMedium
 arrays: Any = mi
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class RenderContext:
-    """Parameters of a rendering: those of the integrator, and the requested AOVs.
+    """Parameters of a rendering: those of the integrator ``nerg``, and the requested AOVs.
 
     ``required_data``: what must be decided before a pixel is computed:
 
@@ -43,26 +43,13 @@ class RenderContext:
       ``spread``: with the standard deviation over its members.
     """
 
+    nerg: Any
     aovs: Sequence[str]
     required_data: frozenset[str]
     # The observer views of the AOVs, by name.
     views: Mapping[str, ObserverView]
     # Whether colour is computed.
     radiance: bool
-    medium: Medium | None
-    gaze: GazeFieldInstance | None
-    shading: Shading
-    # Observer if `CameraView.make_pixel` is called without one; None: the camera.
-    observer: mi.Sensor | None
-    cache: ObserverCache
-    occlusion: bool
-    falloff: Float
-    settings: MarchSettings
-    observer_settings: ObserverSettings
-    ceiling: Ceiling | None
-    background: Color
-    hide_emitters: bool
-    jitter: bool
 
     @property
     def shared_aovs(self) -> list[str]:
@@ -76,11 +63,11 @@ class RenderContext:
 
     def channel_names(self, aovs: Sequence[str]) -> list[str]:
         """Names of the channels of AOVs."""
-        return nerg_aovs.channel_names(aovs, self.medium)
+        return nerg_aovs.channel_names(aovs, self.nerg.medium)
 
     def check_scene(self, scene: mi.Scene) -> None:
         """Raise ``NergError`` for a scene without a medium and shapes."""
-        if self.medium is None and len(scene.shapes()) == 0:
+        if self.nerg.medium is None and len(scene.shapes()) == 0:
             raise NergError(
                 'there is nothing to render; give "nerg" a "field" or a "density", or add shapes to the scene'
             )
@@ -97,7 +84,7 @@ class RenderContext:
         """Trace rays of ``sensors`` (``may_list``: see `CameraView`). Raises ``NergError`` for a scene without a medium
         and shapes."""
         self.check_scene(scene)
-        offset = cast("Any", sampler).next_1d(active) if self.jitter else None
+        offset = cast("Any", sampler).next_1d(active) if self.nerg.jitter else None
         return CameraView(self, scene, sensors, ray, active, offset, may_list)
 
     def make_observer(self, position: Sequence[float], is_only: bool = False) -> ObserverContext:
@@ -106,7 +93,7 @@ class RenderContext:
         p_o = arrays.Point3f(*map(float, position))
         # A literal position would compile a new kernel for each observer.
         dr.make_opaque(p_o)
-        return ObserverContext(p_o, [p_o], self.cache if is_only else ObserverCache(scalar_cache=self.cache))
+        return ObserverContext(p_o, [p_o], self.nerg.cache if is_only else ObserverCache(scalar_cache=self.nerg.cache))
 
 
 @dataclass(eq=False)
@@ -122,8 +109,8 @@ class ObserverContext:
     def gaze(self, context: RenderContext, geometry: SceneGeometry) -> ObservedGaze:
         """The gaze field for these positions, prepared once. ``context``: one with a gaze field."""
         if self._gaze is None:
-            placed = cast("GazeFieldInstance", context.gaze)
-            self._gaze = placed.for_observers(self.positions, geometry, context.observer_settings, self.cache)
+            placed = cast("GazeFieldInstance", context.nerg.gaze)
+            self._gaze = placed.for_observers(self.positions, geometry, context.nerg.observer_settings, self.cache)
         return self._gaze
 
 
@@ -153,8 +140,10 @@ class CameraView:
     ):
         self.context, self.sensors, self.camera_ray, self.active = context, sensors, ray, active
         # The traced ray, and the distance between both origins.
-        self.ray, self.origin_offset = (ray, None) if context.ceiling is None else context.ceiling.clip_ray(ray)
-        medium = context.medium
+        self.ray, self.origin_offset = (
+            (ray, None) if context.nerg.ceiling is None else context.nerg.ceiling.clip_ray(ray)
+        )
+        medium = context.nerg.medium
         self.geometry = SceneGeometry(medium, scene)
         # Rays of the whole image, of which this may be a strip.
         self.num_rays = sum(int(dr.prod(s.film().crop_size())) for s in sensors) or dr.width(ray.o)
@@ -170,7 +159,7 @@ class CameraView:
         self.shader = shader
         self.counts_evaluations = "counts" in context.required_data
         self.ray_hit = traced.trace(
-            self.ray, active, context.settings, offset=offset, count=self.counts_evaluations, color=shader
+            self.ray, active, context.nerg.settings, offset=offset, count=self.counts_evaluations, color=shader
         )
         self.has_matter = active & (self.ray_hit.opacity > 0)
 
@@ -206,7 +195,7 @@ class CameraView:
     @cached_property
     def color(self) -> Color | None:
         """Colour of the medium along the ray, times its opacity; None without colour."""
-        medium = self.context.medium
+        medium = self.context.nerg.medium
         if medium is None or not self.has_color:
             return None
         ray = medium.ray_to_local(self.ray.o, self.ray.d)
@@ -222,7 +211,7 @@ class CameraView:
     @cached_property
     def depth(self) -> Float:
         """Distance along the traced ray to its surface; 0 without absorption."""
-        return self.ray_hit.depth(self.context.observer_settings.depth, self.has_matter)
+        return self.ray_hit.depth(self.context.nerg.observer_settings.depth, self.has_matter)
 
     @property
     def camera_depth(self) -> Float:
@@ -234,7 +223,7 @@ class CameraView:
     @cached_property
     def has_surface(self) -> Bool:
         """Whether the ray meets a surface."""
-        return self.active & self.ray_hit.has_surface(self.context.observer_settings.surface_opacity)
+        return self.active & self.ray_hit.has_surface(self.context.nerg.observer_settings.surface_opacity)
 
     @cached_property
     def p_d(self) -> Point3f:
@@ -244,7 +233,7 @@ class CameraView:
     @cached_property
     def penetration(self) -> Float | float:
         """Penetration depth of light in front of the surface."""
-        return self.ray_hit.penetration(self.context.observer_settings.depth, self.depth)
+        return self.ray_hit.penetration(self.context.nerg.observer_settings.depth, self.depth)
 
     def compute_radiance(
         self, scene: mi.Scene, sampler: mi.Sampler, medium: mi.Medium | None
@@ -257,11 +246,11 @@ class CameraView:
         context, view, front, color = self.context, self.ray_hit, self.ray_hit.medium_opacity, self.color
         if not context.radiance:
             # A nested integrator has its AOVs even if colour is not computed.
-            return mi.Spectrum(0), self.has_matter, [arrays.Float(0)] * len(context.shading.aov_names())
-        behind, nested, shown = context.shading.radiance(
-            scene, sampler, self.ray, medium, view, context.background, context.hide_emitters, self.active
+            return mi.Spectrum(0), self.has_matter, [arrays.Float(0)] * len(context.nerg.shading.aov_names())
+        behind, nested, shown = context.nerg.shading.radiance(
+            scene, sampler, self.ray, medium, view, context.nerg.background, context.nerg.hide_emitters, self.active
         )
-        field = context.medium
+        field = context.nerg.medium
         if field is None or not self.has_color:
             return (1 - front) * behind, self.has_matter | shown, nested
         learned = field.background(self.ray.o, self.ray.d) if scene.environment() is None else None
@@ -307,16 +296,16 @@ class Pixel:
         if self._observer is not None:
             return self._observer
         context, camera = self.context, self.camera
-        if context.observer is None:
+        if context.nerg.observer is None:
             p_o = observer.center_of_ray(camera.sensors, camera.camera_ray)
-            return ObserverContext(p_o, observer.sensor_centers(camera.sensors), context.cache)
-        p_o = observer.sensor_center(context.observer)
-        return ObserverContext(p_o, [p_o], context.cache)
+            return ObserverContext(p_o, observer.sensor_centers(camera.sensors), context.nerg.cache)
+        p_o = observer.sensor_center(context.nerg.observer)
+        return ObserverContext(p_o, [p_o], context.nerg.cache)
 
     @cached_property
     def is_aligned(self) -> bool:
         """Whether the observer is at the camera and therefore sees the same surfaces."""
-        if self._is_aligned or (self._observer is None and self.context.observer is None):
+        if self._is_aligned or (self._observer is None and self.context.nerg.observer is None):
             return True
         return observer.have_same_center(self.camera.sensors, self.observer.p_o)
 
@@ -334,7 +323,7 @@ class Pixel:
     def observer_hit(self) -> ObserverHit:
         """What the observer sees towards the surface; without occlusion the surface itself."""
         context, camera = self.context, self.camera
-        if not context.occlusion or self.is_aligned:
+        if not context.nerg.occlusion or self.is_aligned:
             return ObserverHit(camera.p_d, self.distance_and_direction[0], arrays.Float(1), arrays.Float(0))
         sight = trace_from_observer(
             camera.geometry,
@@ -343,8 +332,8 @@ class Pixel:
             self.observer.p_o,
             camera.penetration,
             camera.has_surface,
-            context.falloff,
-            context.observer_settings,
+            context.nerg.falloff,
+            context.nerg.observer_settings,
             count=camera.counts_evaluations,
             gaze=self.gaze if self._can_use_gaze_map else None,
             cache=self.observer.cache,
@@ -366,9 +355,9 @@ class Pixel:
     def _can_use_gaze_map(self) -> bool:
         """Whether a map can replace the gaze field: it stores no factors, standard deviation or features."""
         required_data = self.context.required_data
-        if self.context.gaze is None or "gaze" not in required_data or required_data & {"factors", "spread"}:
+        if self.context.nerg.gaze is None or "gaze" not in required_data or required_data & {"factors", "spread"}:
             return False
-        return not self.context.gaze.field.config.features
+        return not self.context.nerg.gaze.field.config.features
 
     @cached_property
     def surface_gaze(self) -> SurfaceGaze:

@@ -239,7 +239,7 @@ class _Tracer:
         if not self.per_observer:
             parts = [self._trace_batch(o, d, a, lambda camera: ()) for a in _batch_starts(o)]
             return {name: np.concatenate([part[name] for part in parts]) for name in self.requested}
-        gaze = self.context.gaze
+        gaze = self.context.nerg.gaze
         if self.context.views or (gaze is not None and gaze.field.config.normalized):
             return self._trace_each_origin(o, d)
         parts = [self._trace_batch(o, d, a, lambda camera: (camera.make_pixel_per_origin(),)) for a in _batch_starts(o)]

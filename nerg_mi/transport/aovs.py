@@ -135,14 +135,14 @@ _EVALUATIONS = "evaluations per pixel"
 
 def _features_at(p: Any) -> list:
     return evaluate_features(
-        cast("Medium", p.context.medium), p.p_d, p.has_surface & (p.depth < p.ray_hit.shape_distance)
+        cast("Medium", p.context.nerg.medium), p.p_d, p.has_surface & (p.depth < p.ray_hit.shape_distance)
     )
 
 
 def _color_evaluations(p: Any) -> list:
     import mitsuba as mi
 
-    march, medium = p.ray_hit.march, p.context.medium
+    march, medium = p.ray_hit.march, p.context.nerg.medium
     if not p.has_color or march is None or medium is None:
         return [mi.Float(0)]
     once = dr.select(p.active & (p.ray_hit.medium_opacity > 0), mi.Float(1), 0)
