@@ -251,6 +251,8 @@ class TorchTrainer:
         self.rays = int(np.clip(min(max(0.5 * (self.rays + wanted), self.rays / 2), 2 * self.rays), 64, 2**14))
 
     def descend(self, d, truth, ray, length, p, covered):
+        from nerg_mi.train.trainer import learning_rate_at
+
         torch, s = self.torch, self.s
         sigma, rgb = self.model.sigma_color(p, harmonics(d[ray]))
         tau = (sigma * length).clamp(max=60)
@@ -267,7 +269,7 @@ class TorchTrainer:
         self.optimiser.zero_grad()
         loss.backward()
         for group in self.optimiser.param_groups:
-            group["lr"] = s.learning_rate_at(self.progress)
+            group["lr"] = learning_rate_at(s, self.progress)
         self.optimiser.step()
         if self.steps % 4 == 0:
             decay = min(s.ema_decay, (1 + self.steps) / (10 + self.steps)) ** 4

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import replace
 from types import ModuleType
 from typing import Any
@@ -13,7 +14,6 @@ from nerg_mi.fields.encoding import HashGrid, HashGridConfig
 from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
 from nerg_mi.fields.gaze_product import softplus
 from nerg_mi.fields.mlp import MLP, stack
-from nerg_mi.maths.geometry import AnyBox
 
 from .gaze_data import GazeBatch, GazeTargets, compute_observer_bounds
 from .gaze_recipes import DEFAULT_RECIPE, FieldOptions, Recipe, register_recipe
@@ -23,67 +23,31 @@ from .gaze_trainer import GazeTrainer
 # ---- Forward pass with the networks as tensor products, which trains fastest ----
 
 
-def evaluate_log_density(
-    config: LogGazeConfig, box: AnyBox, parameters: dict, p_od: Any, p_o: Any, r_o: Any, misses: Any, ns: ModuleType
-) -> Any:
-    """Evaluate the log of the unnormalised gaze density.
-
-    Parameters
-    ----------
-    config : LogGazeConfig
-        Configuration of the field.
-    box : AnyBox
-        Bounds of the field.
-    parameters : dict
-        Parameter arrays by their names in the field. Gradients reach every entry that the variant uses.
-    p_od : Array3f
-        Surface points (B * D lanes).
-    p_o : Array3f
-        Observer positions (B lanes).
-    r_o : Array3f
-        Unit viewing directions (B * D lanes), D for each observer in turn.
-    misses : Bool
-        Directions that hit no surface (B * D lanes).
-
-    Returns
-    -------
-    Float
-        Logarithm of what ``LogGazeField.unnormalized`` multiplies (B * D lanes).
-    """
+def evaluate_log_density(field: LogGazeField, batch: GazeBatch, parameters: dict, ns: ModuleType) -> Any:
+    """Evaluate the log of what ``field.unnormalized`` multiplies (Float), with other ``parameters`` by their names, in
+    the B * D directions of a ``batch`` of B observers. Gradients reach every parameter that the variant uses."""
+    config, p_o, r_o = field.config, batch.p_o, batch.r_o
     net = lambda name: MLP([parameters[f"{name}.{i}"] for i in range(config.layers + 1)])
     # The field computes the network inputs.
-    field = _Inputs(
-        config, box, HashGrid.from_parameters(config.grid, parameters, mode=dr.ReduceMode.Expand), parameters["prior"]
-    )
+    field = copy(field)
+    field.grid = HashGrid.from_parameters(config.grid, parameters, mode=dr.ReduceMode.Expand)
+    field.prior = parameters["prior"]
     repeats = dr.width(r_o) // dr.width(p_o)
     logit = field.log_base(r_o)
     each = dr.gather(type(p_o), p_o, dr.arange(ns.UInt32, dr.width(r_o)) // repeats)
     if config.variant != "capture":
-        inputs = field.emit_inputs(p_od, each, r_o)
+        inputs = field.emit_inputs(batch.p_od, each, r_o)
         emit = net("emit_net").tensor(stack(_broadcast(inputs, r_o), ns)).array
-        logit = logit + (
-            emit
-            if config.escaped == "nearest"
-            else dr.select(
-                misses,
-                dr.gather(
-                    ns.Float, parameters["escaped"], dr.zeros(ns.UInt32, dr.width(r_o)), mode=dr.ReduceMode.Expand
-                ),
-                emit,
-            )
-        )
+        if config.escaped != "nearest":
+            one = dr.zeros(ns.UInt32, dr.width(r_o))
+            escaped = dr.gather(ns.Float, parameters["escaped"], one, mode=dr.ReduceMode.Expand)
+            emit = dr.select(batch.misses, escaped, emit)
+        logit = logit + emit
     if config.variant != "emit":
         position = [dr.repeat(v, repeats) for v in field.capture_position(p_o)]
         x = net("capture_net").tensor(stack(_broadcast(field.capture_inputs(position, r_o), r_o), ns)).array
         logit = logit - softplus(-x)
     return logit
-
-
-class _Inputs(LogGazeField):
-    """A field without networks, used for its inputs."""
-
-    def __init__(self, config: LogGazeConfig, box: AnyBox, grid: HashGrid, prior: Any):
-        self.config, self.box, self.grid, self.prior = config, box, grid, prior
 
 
 def _broadcast(rows: list, like: Any) -> list:
@@ -104,7 +68,6 @@ class LikelihoodTrainer(GazeTrainer):
     """Trains a ``LogGazeField`` by maximum likelihood; see ``GazeTrainer``. Requires ``targets.prior_table``."""
 
     def complete_config(self, config: LogGazeConfig, targets: GazeTargets) -> LogGazeConfig:
-        self._prior_table = targets.prior_table
         # Capture's encoding spans the observer positions.
         return replace(config, heads=targets.observer_bounds or compute_observer_bounds(targets.positions, self.box))
 
@@ -114,7 +77,7 @@ class LikelihoodTrainer(GazeTrainer):
         self._cumulative = np.cumsum(targets.truth, axis=1, dtype=np.float64)
 
     def init_field(self) -> LogGazeField:
-        return LogGazeField.random(self.config, self.box, self.ns, self.settings.seed, self._prior_table)
+        return LogGazeField.random(self.config, self.box, self.ns, self.settings.seed, self._targets.prior_table)
 
     def select_trainable(self, parameters: dict) -> dict:
         """Select the trainable ``parameters``: all but the position-independent prior and what the variant does not
@@ -122,7 +85,7 @@ class LikelihoodTrainer(GazeTrainer):
         unused = {"emit": ("capture_net",), "capture": ("emit_net", "grid", "escaped")}.get(self.config.variant, ())
         if self.config.escaped == "nearest":
             unused += ("escaped",)
-        return {k: v for k, v in parameters.items() if k != "prior" and not k.startswith(unused or ("-",))}
+        return {k: v for k, v in super().select_trainable(parameters).items() if not k.startswith(unused)}
 
     def draw_batch(self) -> GazeBatch:
         """Draw uniform directions, followed by rays of the true density."""
@@ -136,7 +99,7 @@ class LikelihoodTrainer(GazeTrainer):
         return data.gather_batch(observers, np.concatenate([uniform, rays], axis=1))
 
     def compute_loss(self, batch: GazeBatch) -> Any:
-        logit = self._evaluate_logit(batch, self.current_parameters())
+        logit = evaluate_log_density(self.initial_field, batch, self.current_parameters(), self.ns)
         # Split each probe's directions into the uniform ones and the rays.
         ns, count, rays = self.ns, dr.width(batch.p_o), self.settings.rays
         run = dr.width(batch.r_o) // count
@@ -145,13 +108,8 @@ class LikelihoodTrainer(GazeTrainer):
         likelihood = dr.block_sum(part(rays, D), rays) / rays
         return dr.mean(log_mean_exp(part(D, 0), D) - likelihood + dr.log(batch.solid_angle))
 
-    def _evaluate_logit(self, batch: GazeBatch, parameters: dict) -> Any:
-        return evaluate_log_density(
-            self.config, self.box, parameters, batch.p_od, batch.p_o, batch.r_o, batch.misses, self.ns
-        )
-
     def evaluate_density(self, batch: GazeBatch, parameters: dict) -> Any:
-        logit = self._evaluate_logit(batch, parameters)
+        logit = evaluate_log_density(self.initial_field, batch, parameters, self.ns)
         D = dr.width(logit) // dr.width(batch.solid_angle)
         return dr.exp(logit - dr.repeat(log_mean_exp(logit, D) + dr.log(batch.solid_angle), D))
 

@@ -19,7 +19,7 @@ from nerg_mi.maths.geometry import AnyBox
 
 from .gaze_data import GazeBatch, GazeTargets, TargetArrays
 from .gaze_settings import MIN_MEAN_DENSITY, GazeSettings
-from .trainer import Trainer
+from .trainer import Trainer, learning_rate_at
 
 # ---- Losses between predicted and true gaze densities of probes, in Dr.Jit ----
 #
@@ -279,7 +279,7 @@ class GazeTrainer(Trainer, ABC):
             if epoch != self._epoch:
                 self.set_targets(self._targets.resample(epoch), epoch)
         dr.backward(self.compute_loss(self.draw_batch()))
-        self.optimiser.set_learning_rate(self.settings.learning_rate_at(self.progress))
+        self.optimiser.set_learning_rate(learning_rate_at(self.settings, self.progress))
         self.optimiser.step()
         self.steps += 1
         self.average_weights()

@@ -41,11 +41,6 @@ class RunSettings(ValidatedDataclass):
         if (self.steps is None) == (self.minutes is None):
             raise NergError("set the length of the training either in steps or in minutes")
 
-    def learning_rate_at(self, progress: float) -> float:
-        """Learning rate at ``progress`` in 0..1 of the run."""
-        late = max(0.0, progress - self.lr_hold_fraction) / (1 - self.lr_hold_fraction)
-        return self.learning_rate * self.lr_final_ratio ** min(late, 1.0)
-
     def to_dict(self) -> dict:
         """Return the settings as JSON, for the provenance."""
         return asdict(self)  # pyright: ignore[reportArgumentType] it is a dataclass

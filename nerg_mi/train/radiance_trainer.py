@@ -44,7 +44,7 @@ from .radiance_sampling import (
     sum_along_rays,
 )
 from .radiance_settings import RadianceSettings, adapt_ray_count, limit_ray_count, refine_stride
-from .trainer import StepClock, Trainer, check_shape, read_count
+from .trainer import StepClock, Trainer, check_shape, learning_rate_at, read_count
 
 # ---- Previews rendered with the trainer's march, for the validation error ----
 
@@ -497,7 +497,7 @@ class RadianceTrainer(Trainer):
             if name.startswith("grid."):
                 gradient = gradient + feature_decay_gradient(weights[name], s.grid_decay)
             dr.set_grad(self.optimiser[name], gradient)
-        self.optimiser.set_learning_rate(s.learning_rate_at(self.progress))
+        self.optimiser.set_learning_rate(learning_rate_at(s, self.progress))
         self.optimiser.step()
         self.loss, self.samples = loss, samples.count
         if self.steps % self.AVERAGE_INTERVAL == 0:

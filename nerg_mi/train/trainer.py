@@ -19,7 +19,15 @@ from nerg_mi.files.schema import Items, Number, check_json
 from nerg_mi.formats.fields import read_number
 from nerg_mi.interruption import Interrupted
 
+from .radiance_settings import RunSettings
+
 # ---- Trainer ----
+
+
+def learning_rate_at(settings: RunSettings, progress: float) -> float:
+    """Return the learning rate at ``progress`` in 0..1 of a run."""
+    late = max(0.0, progress - settings.lr_hold_fraction) / (1 - settings.lr_hold_fraction)
+    return settings.learning_rate * settings.lr_final_ratio ** min(late, 1.0)
 
 
 class Trainer:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import drjit as dr
 import drjit.llvm.ad as ns
@@ -123,7 +125,8 @@ def test_the_fast_path_is_the_field(variant, escape):
     p_o, p_od, r = vectors(12)
     p_o = np.repeat(p_o[:3], 4, axis=0)
     gone = ns.Bool([i % 3 == 0 for i in range(12)])
-    fast = evaluate_log_density(field.config, BOX, field.parameters(), jit(p_od), jit(p_o[::4]), jit(r), gone, ns)
+    batch: Any = SimpleNamespace(p_od=jit(p_od), p_o=jit(p_o[::4]), r_o=jit(r), misses=gone)
+    fast = evaluate_log_density(field, batch, field.parameters(), ns)
     emit, capture = field.unnormalized(jit(p_od), jit(p_o), jit(r), escaped=gone)
     np.testing.assert_allclose(np.array(fast), np.log(np.array(emit * capture)), atol=2e-5)
 
@@ -135,16 +138,8 @@ def test_gradients_reach_what_the_variant_uses(variant):
     parameters = {name: field.parameters()[name] for name in trained.keys()}
     dr.enable_grad(parameters)
     p_o, p_od, r = vectors(4)
-    logit = evaluate_log_density(
-        field.config,
-        BOX,
-        {**field.parameters(), **parameters},
-        jit(p_od),
-        jit(p_o[:1]),
-        jit(r),
-        ns.Bool([True] + 3 * [False]),
-        ns,
-    )
+    batch: Any = SimpleNamespace(p_od=jit(p_od), p_o=jit(p_o[:1]), r_o=jit(r), misses=ns.Bool([True] + 3 * [False]))
+    logit = evaluate_log_density(field, batch, {**field.parameters(), **parameters}, ns)
     dr.backward(dr.sum(logit))
     assert "prior" not in parameters
     for name, value in parameters.items():

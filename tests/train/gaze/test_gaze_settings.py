@@ -19,6 +19,7 @@ from nerg_mi.train.gaze_product import make_gaze_config
 from nerg_mi.train.gaze_recipes import DEFAULT_RECIPE, FieldOptions, get_recipe, load_recipes, register_recipe
 from nerg_mi.train.gaze_settings import CODE, LOSSES, PAPER, GazeSettings
 from nerg_mi.train.gaze_trainer import KLD_EPS, compute_gaze_loss
+from nerg_mi.train.trainer import learning_rate_at
 
 from .looks import BOX, NOWHERE
 
@@ -121,9 +122,9 @@ def test_refusals():
 
 def test_the_learning_rate_is_held_and_then_falls_to_its_last():
     s = GazeSettings(steps=10, learning_rate=0.02, lr_final_ratio=0.04, lr_hold_fraction=0.25)
-    assert s.learning_rate_at(0) == s.learning_rate_at(0.25) == pytest.approx(0.02)
-    assert s.learning_rate_at(0.625) == pytest.approx(0.02 * 0.2) and s.learning_rate_at(1) == s.learning_rate_at(
-        1.5
+    assert learning_rate_at(s, 0) == learning_rate_at(s, 0.25) == pytest.approx(0.02)
+    assert learning_rate_at(s, 0.625) == pytest.approx(0.02 * 0.2) and learning_rate_at(s, 1) == learning_rate_at(
+        s, 1.5
     ) == pytest.approx(0.02 * 0.04)
 
 
@@ -250,7 +251,7 @@ def test_the_papers_recipe_is_fifty_epochs_at_a_rate_that_falls_from_the_start()
     recipe = get_recipe("paper")
     settings = recipe.settings
     assert settings.steps is not None and settings.steps * settings.probes == 50 * recipe.probes.probes
-    assert settings.learning_rate_at(0) == pytest.approx(1e-3) and settings.learning_rate_at(0.01) < 1e-3
-    assert settings.learning_rate_at(0.5) == pytest.approx(1e-3 * 0.1**0.5) and settings.learning_rate_at(
-        1
+    assert learning_rate_at(settings, 0) == pytest.approx(1e-3) and learning_rate_at(settings, 0.01) < 1e-3
+    assert learning_rate_at(settings, 0.5) == pytest.approx(1e-3 * 0.1**0.5) and learning_rate_at(
+        settings, 1
     ) == pytest.approx(1e-4)
