@@ -1,12 +1,14 @@
 """Re-aimed hits: the part of a gaze field that is a mixture of kernel densities of training samples.
 
 q(r_o | p_o) = Σ_k v_k q_k(r_o | p_o) / Σ_k v_k
-q_k(r_o | p_o) = Σ_j w_j f(r_o; a_j, κ_k) / Σ_j w_j,  w_j = exp(-|o_j - p_o|² / 2b_k²),  a_j = (h_j - p_o) / |h_j - p_o|
+q_k(r_o | p_o) = u / 4π + (1 - u) Σ_j w_j f(r_o; a_j, κ_k) / Σ_j w_j,
+w_j = exp(-|o_j - p_o|² / 2b_k²),  a_j = (h_j - p_o) / |h_j - p_o|,  u = 1 - exp(-min_j |o_j - p_o|² / 2R²)
 
 Sample j was recorded at o_j and hit a surface at h_j. Seen from the observer p_o, it points in the direction a_j, so
 that the kernels f (von Mises-Fisher, concentration κ) follow the parallax of the surfaces. Without the re-aiming it is
 the conditional kernel density of Rosenblatt (1969). It resolves what attracts attention as finely as the samples do,
-but says little where nobody stood nearby, where the networks of a gaze field still generalise. A gaze field
+but says little where nobody stood nearby, where the networks of a gaze field still generalise: farther from all
+samples than half the diagonal R of their bounding box it becomes uniform. A gaze field
 mixes both, with kernels of several bandwidths b and concentrations κ, whose weights v are fitted
 (`nerg_mi.train.stacking`).
 """
@@ -40,6 +42,7 @@ FAR = 1e4  # Maximum distance, in bandwidths, at which the point of a sample wit
 # Distance from the observer, in bandwidths, below which the direction to a point is that of the recording: the gaze on
 # a nearby point says nothing about observers next to it.
 _MIN_DISTANCE = 0.25
+_UNIFORM = 1 / (4 * np.pi)  # 1/sr
 _TABLE_SPACING = 0.2  # Texels of a table in units of 1/sqrt(κ): errors below 3e-4 of the maximum of a kernel
 _MIN_TABLE_LANES = 8192  # Number of directions below which a table is not considered
 
@@ -58,7 +61,8 @@ class HitNeighbours(NamedTuple):
     directions: np.ndarray  # Unit directions from the position to the hit point (P, k, 3)
     weights: np.ndarray  # (P, k)
     inverse_distance: np.ndarray  # Inverse distance of the hit point (P, k); 0 for a direction of the recording
-    offsets: np.ndarray  # From the position to the origin of the sample (P, k, 3)
+    offsets: np.ndarray  # From the position to the origin of the sample (P, k, 3), nearest first
+    uniform_weight: np.ndarray  # Weight (P,) of the uniform density far from all samples
 
 
 class _NearestSamples(NamedTuple):
@@ -69,7 +73,7 @@ class _NearestSamples(NamedTuple):
     to_point: np.ndarray  # From the position to the hit point (P, k, 3)
     recorded: np.ndarray  # Recorded directions (P, k, 3)
 
-    def weigh(self, bandwidth: float) -> HitNeighbours:
+    def weigh(self, bandwidth: float, extent: float) -> HitNeighbours:
         # Relative to the nearest sample, so that the weights do not vanish far from all samples.
         weights = np.exp(0.5 * (self.distance[:, :1] ** 2 - self.distance**2) / bandwidth**2)
         min_distance = _MIN_DISTANCE * bandwidth
@@ -80,7 +84,8 @@ class _NearestSamples(NamedTuple):
         directions[is_lost, 0], weights[is_lost, 0] = (0, 0, 1), 1
         length = np.linalg.norm(self.to_point, axis=-1)
         inverse = np.where(length > min_distance, 1 / np.maximum(length, min_distance), 0)
-        return HitNeighbours(directions, weights.astype(np.float32), inverse, self.offsets)
+        uniform_weight = -np.expm1(-0.5 * (self.distance[:, 0] / extent) ** 2)
+        return HitNeighbours(directions, weights.astype(np.float32), inverse, self.offsets, uniform_weight)
 
 
 class ReaimedHits:
@@ -129,6 +134,13 @@ class ReaimedHits:
         return sum(kernel.weight for kernel in self.kernels)
 
     @cached_property
+    def extent(self) -> float:
+        """Half the diagonal of the bounding box of the origins, but at least the largest bandwidth: the distance at
+        which an observer is far from all samples."""
+        diagonal = np.linalg.norm(np.ptp(self.origins.astype(np.float64), axis=0))
+        return max(0.5 * float(diagonal), *(kernel.bandwidth for kernel in self.kernels))
+
+    @cached_property
     def _tree(self) -> Any:
         from scipy.spatial import KDTree
 
@@ -171,7 +183,7 @@ class ReaimedHits:
         for bandwidth, level in self._levels.items():
             if level not in nearest:
                 nearest[level] = self._find_nearest(positions, level)
-            neighbours[bandwidth] = nearest[level].weigh(bandwidth)
+            neighbours[bandwidth] = nearest[level].weigh(bandwidth, self.extent)
         return [neighbours[kernel.bandwidth] for kernel in self.kernels]
 
     def _find_nearest(self, positions: np.ndarray, level: int) -> _NearestSamples:
@@ -197,7 +209,8 @@ class ReaimedHits:
                     offset = directions[rows, None] - near.directions
                     distances[bandwidth] = np.einsum("pkc,pkc->pk", offset, offset)
                 terms = near.weights * np.exp(np.float32(-0.5 * kappa) * distances[bandwidth])
-                densities[rows, k] = np.exp(log_normaliser(kappa)) * terms.sum(axis=1) / near.weights.sum(axis=1)
+                density = np.exp(log_normaliser(kappa)) * terms.sum(axis=1) / near.weights.sum(axis=1)
+                densities[rows, k] = density + near.uniform_weight * (_UNIFORM - density)
         return densities
 
     def mix(self, gaze: Float, density: Float) -> Float:
@@ -207,7 +220,7 @@ class ReaimedHits:
     def observe(self, positions: np.ndarray, ns: ModuleType) -> ObservedHits:
         """Make the density of the observers at ``positions``, (3,) or (P, 3) in the field's frame, on the backend
         ``ns``."""
-        return ObservedHits(self.kernels, self.find(positions), ns)
+        return ObservedHits(self.kernels, self.find(positions), self.extent, ns)
 
 
 def place_missing_points(
@@ -237,8 +250,11 @@ def place_missing_points(
 class ObservedHits:
     """The density of re-aimed hits for one observer, or for several without a table."""
 
-    def __init__(self, kernels: Sequence[HitKernel], neighbours: Sequence[HitNeighbours], ns: ModuleType):
-        self._kernels, self._neighbours, self._ns = kernels, neighbours, ns
+    def __init__(
+        self, kernels: Sequence[HitKernel], neighbours: Sequence[HitNeighbours], extent: float, ns: ModuleType
+    ):
+        self._kernels, self._neighbours, self._extent, self._ns = kernels, neighbours, extent, ns
+        self._uniform_weights = [ns.Float(near.uniform_weight.astype(np.float32)) for near in neighbours]
         self._kdes = [_make_kde(near, kernel.kappa, ns) for kernel, near in zip(kernels, neighbours)]
         self._tables: list[SphericalKdeTable | None] = [None] * len(kernels)
         total = sum(kernel.weight for kernel in kernels)
@@ -252,7 +268,7 @@ class ObservedHits:
             HitNeighbours(*(np.concatenate(arrays) for arrays in zip(*of_kernel)))
             for of_kernel in zip(*(o._neighbours for o in observed))
         ]
-        return cls(first._kernels, neighbours, first._ns)
+        return cls(first._kernels, neighbours, first._extent, first._ns)
 
     @property
     def is_tabulated(self) -> bool:
@@ -268,7 +284,10 @@ class ObservedHits:
 
     def evaluate(self, directions: np.ndarray) -> np.ndarray:
         """Densities (P, D) of all P observers in unit ``directions`` (D, 3), or (P, D, 3), float64."""
-        return self._add([kde.evaluate(directions).astype(np.float64) for kde in self._kdes])
+        densities = [kde.evaluate(directions).astype(np.float64) for kde in self._kdes]
+        return self._add(
+            [d + near.uniform_weight[:, None] * (_UNIFORM - d) for d, near in zip(densities, self._neighbours)]
+        )
 
     def density(self, r_o: Vector3f, p_o: Point3f, observer: Any = None) -> Float:
         """Density (1/sr) in unit directions ``r_o``, in the field's frame, for the observers with the indices
@@ -288,12 +307,13 @@ class ObservedHits:
                 kde.density(observer, d) if table is None else table.density(d)
                 for kde, table in zip(self._kdes, self._tables)
             ]
-            total = self._add(values)
+            uniform = [dr.gather(ns.Float, weight, observer) for weight in self._uniform_weights]
+            total = self._add([dr.lerp(value, _UNIFORM, weight) for value, weight in zip(values, uniform)])
         if not dr.grad_enabled(r_o, p_o):
             return total
         with dr.suspend_grad():
             slopes = [
-                _compute_slopes(ns, near, kernel, d, value, observer)
+                _compute_slopes(ns, near, kernel, self._extent, d, value, observer)
                 for kernel, near, value in zip(self._kernels, self._neighbours, values)
             ]
             slope_r, slope_p = (self._add(parts) for parts in zip(*slopes))
@@ -316,9 +336,10 @@ def _make_kde(neighbours: HitNeighbours, kappa: float, ns: ModuleType) -> Spheri
 
 
 def _compute_slopes(
-    ns: ModuleType, near: HitNeighbours, kernel: HitKernel, d: Any, value: Any, observer: Any
+    ns: ModuleType, near: HitNeighbours, kernel: HitKernel, extent: float, d: Any, value: Any, observer: Any
 ) -> tuple[Any, Any]:
-    """Derivatives of the density ``value`` of a kernel with respect to the directions ``d`` and to the position."""
+    """Derivatives of the density of a kernel with respect to the directions ``d`` and to the position; ``value`` is the
+    density without the uniform one."""
     size, kappa = near.weights.shape[1], kernel.kappa
     offsets = near.offsets / kernel.bandwidth**2
     weights = near.weights / near.weights.sum(axis=1, keepdims=True)
@@ -343,4 +364,7 @@ def _compute_slopes(
         labels=("i", "by_r", "by_p", "d", "value", "first"),
         label="slopes of re-aimed hits",
     )
-    return by_r, by_p
+    rest = (1 - near.uniform_weight[:, None]) * np.concatenate([np.ones((len(offsets), 1)), near.offsets[:, 0]], axis=1)
+    columns = ns.Float((rest / [1, extent**2, extent**2, extent**2]).astype(np.float32).ravel())
+    share, *slope = (dr.gather(ns.Float, columns, observer * 4 + k) for k in range(4))
+    return share * by_r, share * by_p + (value - _UNIFORM) * ns.Array3f(*slope)

@@ -27,7 +27,10 @@ def reference(origins, points, bandwidth, kappa, p, d):
     aim = np.where(near[:, None], points - origins, aim)
     aim /= np.linalg.norm(aim, axis=1, keepdims=True)
     peak = kappa / (2 * np.pi * (1 - np.exp(-2 * kappa)))
-    return (peak * np.exp(kappa * (d @ aim.T - 1))) @ weight / weight.sum()
+    density = (peak * np.exp(kappa * (d @ aim.T - 1))) @ weight / weight.sum()
+    extent = max(np.linalg.norm(np.ptp(origins, axis=0)) / 2, bandwidth)
+    known = np.exp(-square.min() / (2 * extent**2))
+    return known * density + (1 - known) / (4 * np.pi)
 
 
 def evaluate(hits, p, d):
@@ -70,7 +73,7 @@ def test_samples_without_a_hit_keep_their_direction():
 def test_kernels_are_mixed():
     """The density is the mean of those of the kernels, and has their derivatives."""
     origins, points = sample(60, 3)
-    kernels = HitKernel(0.3, 0.4, 60.0), HitKernel(0.1, 0.4, 10.0), HitKernel(0.2, 2.0, 60.0)
+    kernels = HitKernel(0.3, 0.4, 60.0), HitKernel(0.1, 0.4, 10.0), HitKernel(0.2, 1.0, 60.0)
     hits, p = ReaimedHits(origins, points, kernels), np.array((0.2, 0.1, 0.0))
     assert hits.weight == pytest.approx(0.6)
 
@@ -129,10 +132,11 @@ def test_only_the_nearest_samples_count():
     np.testing.assert_allclose((near.offsets[0] ** 2).sum(axis=1), square, rtol=1e-5)
 
 
-def test_gradients_equal_finite_differences():
+@pytest.mark.parametrize("p", [(0.1, -0.2, 0.3), (1.6, -1.2, 0.9)])
+def test_gradients_equal_finite_differences(p):
     origins, points = sample(60, 3)
     hits = ReaimedHits(origins, points, [HitKernel(0.5, 0.5, 20.0)])
-    p, d = np.array((0.1, -0.2, 0.3)), fibonacci_directions(50)
+    p, d = np.array(p), fibonacci_directions(50)
     observed = hits.observe(p, ns)
     r_o, p_o = to_vector(ns.Array3f, d), ns.Array3f(*p.tolist())
     dr.enable_grad(r_o, p_o)
