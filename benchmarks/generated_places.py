@@ -201,7 +201,12 @@ def _gallery() -> GeneratedPlace:
         )
     )
     return GeneratedPlace(
-        name="gallery", boxes=tuple(boxes), things=tuple(shapes), floor=((0.6, 0.6), (9.4, 7.4)), falloff=4.0, free=free
+        name="generated-gallery",
+        boxes=tuple(boxes),
+        things=tuple(shapes),
+        floor=((0.6, 0.6), (9.4, 7.4)),
+        falloff=4.0,
+        free=free,
     )
 
 
@@ -222,7 +227,7 @@ def _office() -> GeneratedPlace:
         [(np.abs(p[:, 0] - x) < 0.85) & (p[:, 1] > y - 0.45) & (p[:, 1] < y + 0.45) for x, y in spots], axis=0
     )
     return GeneratedPlace(
-        name="office",
+        name="generated-office",
         boxes=tuple(boxes),
         things=tuple(shapes),
         floor=((0.4, 0.4), (8.6, 5.6)),
@@ -239,7 +244,7 @@ def _corridor() -> GeneratedPlace:
     shapes += [Thing((x, 1.98, 1.5), (0.4, 0.01, 0.5), d) for x, d in ((5, 0.4), (12, 0.8))]
     shapes.append(Thing((19.98, 1, 1.6), (0.01, 0.6, 0.7), 1.5))
     return GeneratedPlace(
-        name="corridor",
+        name="generated-corridor",
         boxes=tuple(_walls(20, 2, 2.6)),
         things=tuple(shapes),
         floor=((0.5, 0.5), (19.5, 1.5)),
@@ -255,7 +260,7 @@ def _stage() -> GeneratedPlace:
     shapes = [Thing((6, 2.2, 2.3), (0.5, 0.2, 0.4), 4.0), Thing((3.4, 2, 2.0), (0.5, 0.3, 0.8), 1.5)]
     shapes += [Thing((8.8, 2.4, 2.0), (0.5, 0.3, 0.8), 1.0), Thing((6, 0.02, 4.3), (2.5, 0.01, 1.0), 1.2)]
     return GeneratedPlace(
-        name="stage",
+        name="generated-stage",
         boxes=tuple(boxes),
         things=tuple(shapes),
         floor=((1.2, 7.0), (10.8, 14.5)),

@@ -1,6 +1,6 @@
 """How well do the last looks, or the direction of the head, predict gaze, alone and together with a gaze field?
 
-    python benchmarks/next_look.py [looks] [--only supermarket,office,gallery,room,truck] [--folds 3] [--seed 1]
+    python benchmarks/next_look.py [looks] [--only supermarket,generated-office,room] [--folds 3] [--seed 1]
         [--out out/benchmarks/next_look]
     python benchmarks/next_look.py heads --only supermarket,room,truck --folds 2
 

@@ -1,15 +1,15 @@
 """Gaze fields compared with simpler baselines by one protocol in several scenes.
 
-    python benchmarks/places.py [--only room,office] [--folds 4] [--seed 0] [--prior-folds N] [--prior-kappa K]
+    python benchmarks/places.py [--only room,vr-office] [--folds 4] [--seed 0] [--prior-folds N] [--prior-kappa K]
         [--recipe default] [--variant VARIANT] [--no-surfaces] [--against FOLDS.csv] [--out out/benchmarks/places]
     python benchmarks/places.py --uncertainty --folds 3 --zones 6 [--ensemble 5] [--out out/benchmarks/uncertainty]
 
-The scenes are recordings of a supermarket (with surfaces from hit points), recordings of EyeNavGS scenes (without
-geometry), the demo store's shoppers in its radiance field, and four generated scenes with walls and their own laws of
-attention (`generated_places.py`). In each fold, one half of the participants trains the field. The other half is scored
-at 60 positions in three zones. Training data within 2R of these positions are excluded. The baselines are those of
-`nerg eval gaze`, tuned on the training rays. The agreement between two halves of the held-out participants (split half)
-is a reference.
+The scenes are recordings of a supermarket and of a VR office (with surfaces from hit points), recordings of EyeNavGS
+scenes (without geometry), the demo store's shoppers in its radiance field, and four generated scenes with walls and
+their own laws of attention (`generated_places.py`). In each fold, one half of the participants trains the field. The
+other half is scored at 60 positions in three zones. Training data within 2R of these positions are excluded. The
+baselines are those of `nerg eval gaze`, tuned on the training rays. The agreement between two halves of the held-out
+participants (split half) is a reference.
 
 The best baseline is chosen by the same scores, which favours the baselines. "Field minus best baseline" has the 95 %
 interval over participants: folds share participants, so that it is that of one fold (root mean square over folds).
@@ -50,7 +50,7 @@ def place_parser(what: str, out: str, folds: int, only: str | None = None) -> ar
         "--data",
         type=Path,
         default=data,
-        help="Folder with the recordings vr_supermarket and eyenavgs. Default: the variable NERG_DATA, else "
+        help="Folder with the recordings vr_supermarket, vr_office and eyenavgs. Default: the variable NERG_DATA, else "
         "../shared/data.",
     )
     parser.add_argument(
@@ -99,8 +99,10 @@ def makers(data: Path) -> dict[str, Make]:
     from generated_places import PLACES
 
     out: dict[str, Make] = {}
-    if shop := sorted((data / "vr_supermarket").glob("*.csv.gz")):
-        out["supermarket"] = lambda folder: (recorded(shop, "vr_supermarket", folder), "hits")
+    for name, source in (("supermarket", "vr_supermarket"), ("vr-office", "vr_office")):
+        if files := sorted((data / source).glob("*.csv.gz")):
+            # One experiment, with the same columns in both environments
+            out[name] = lambda folder, files=files: (recorded(files, "vr_supermarket", folder), "hits")
     for scene in sorted(path for path in (data / "eyenavgs").glob("*") if path.is_dir()):
         if files := sorted(scene.glob("*.csv.gz")):
             out[scene.name] = lambda folder, files=files: (recorded(files, "eyenavgs", folder), "none")
@@ -190,6 +192,7 @@ def main(argv=None) -> None:
         parser.error(f'"{args.against}" is not there; it is written by a run whose --out is its folder')
     each: list[dict] = []
     unsure: list[dict] = []
+    kinds: list[dict] = []
     for name, make in parse_environments(args).items():
         result = evaluate(name, make, args)
         each += [
@@ -197,6 +200,7 @@ def main(argv=None) -> None:
             for row in result.each
         ]
         unsure += uncertainty(name, result)
+        kinds += [{"place": name, **row} for row in result.verdicts]
     write_csv(args.out / "folds.csv", each)
     seeds = ", ".join(map(str, range(args.seed, args.seed + args.folds)))
     if args.uncertainty:
@@ -204,6 +208,7 @@ def main(argv=None) -> None:
         return
     save_places(args.result, each, seeds)
     save_methods(f"{args.result}-methods", each, seeds)
+    save_kinds(f"{args.result}-kinds", kinds, seeds)
     if args.against is not None:
         show_change(each, args.against)
 
@@ -303,6 +308,27 @@ def save_methods(name: str, each: list[dict], seeds: str) -> None:
         means = (sum(float(r[s]) for r in rows) / len(rows) for s in SCORES)
         table.append([place, method, *("" if isnan(mean) else f"{mean:.3f}" for mean in means)])
     save_result(name, ("scene", "method", *SCORES), table, seeds)
+
+
+def save_kinds(name: str, rows: list[dict], seeds: str) -> None:
+    """Mean bits over the prior at recorded and at new positions, of the field and of the baseline that is best on
+    average, and their difference in each fold."""
+    import numpy as np
+
+    table = []
+    for place, kind in dict.fromkeys((row["place"], row["kind"]) for row in rows):
+        bits: dict[str, list[float]] = {}
+        for row in rows:
+            if (row["place"], row["kind"]) == (place, kind):
+                bits.setdefault(row["method"], []).append(row["bits"])
+        best = max((m for m in bits if m != OURS), key=lambda m: np.mean(bits[m]))
+        less = np.subtract(bits[OURS], bits[best])
+        means = [f"{np.mean(bits[method]):.3f}" for method in (OURS, best)]
+        table.append(
+            [place, kind, means[0], best, means[1], f"{less.mean():+.3f}", ", ".join(f"{v:+.3f}" for v in less)]
+        )
+    head = ("scene", "positions", "field", "best baseline", "its value", "field minus best baseline", "by fold")
+    save_result(name, head, table, seeds)
 
 
 def uncertainty(name: str, result) -> list[dict]:
