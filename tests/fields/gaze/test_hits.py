@@ -18,8 +18,9 @@ def sample(count=40, seed=0):
     return rng.uniform(-1, 1, (count, 3)), 2 * np.sign(rng.normal(size=(count, 3))) * rng.random((count, 3))
 
 
-def reference(origins, points, bandwidth, kappa, p, d):
-    """The density in directions ``d`` (N, 3) in float64, without any nearest neighbours."""
+def reference(origins, points, bandwidth, kappa, p, d, widest=0.0):
+    """The density in directions ``d`` (N, 3) in float64, without any nearest neighbours; ``widest`` is the bandwidth of
+    another kernel."""
     square = ((origins - p) ** 2).sum(axis=1)
     weight = np.exp((square.min() - square) / (2 * bandwidth**2))
     aim = points - p
@@ -28,7 +29,7 @@ def reference(origins, points, bandwidth, kappa, p, d):
     aim /= np.linalg.norm(aim, axis=1, keepdims=True)
     peak = kappa / (2 * np.pi * (1 - np.exp(-2 * kappa)))
     density = (peak * np.exp(kappa * (d @ aim.T - 1))) @ weight / weight.sum()
-    extent = max(np.linalg.norm(np.ptp(origins, axis=0)) / 2, bandwidth)
+    extent = max(np.linalg.norm(np.ptp(origins, axis=0)) / 2, bandwidth, widest)
     known = np.exp(-square.min() / (2 * extent**2))
     return known * density + (1 - known) / (4 * np.pi)
 

@@ -167,10 +167,13 @@ def test03c_hits_are_seen_from_the_observer():
     for hit in (None, rays.origin + 3 * rays.direction):
         rays = replace(rays, hit=hit)
         columns = make_hits(rays, NOWHERE, ALL_HIT_KERNELS).evaluate_kernels(positions, directions)
-        far = rays.origin + FAR * max(bandwidth for bandwidth, _ in HIT_KERNELS) * rays.direction
+        widest = max(bandwidth for bandwidth, _ in HIT_KERNELS)
+        far = rays.origin + FAR * widest * rays.direction
         for column, (bandwidth, kappa) in zip(columns.T, HIT_KERNELS):
             points = far if hit is None else hit
-            expected = [reference(rays.origin, points, bandwidth, kappa, p, d) for p, d in zip(positions, directions)]
+            expected = [
+                reference(rays.origin, points, bandwidth, kappa, p, d, widest) for p, d in zip(positions, directions)
+            ]
             np.testing.assert_allclose(column, expected, rtol=5e-3, atol=1e-5)
 
 
