@@ -30,8 +30,8 @@ def reference(origins, points, bandwidth, kappa, p, d, widest=0.0):
     peak = kappa / (2 * np.pi * (1 - np.exp(-2 * kappa)))
     density = (peak * np.exp(kappa * (d @ aim.T - 1))) @ weight / weight.sum()
     extent = max(np.linalg.norm(np.ptp(origins, axis=0)) / 2, bandwidth, widest)
-    known = np.exp(-square.min() / (2 * extent**2))
-    return known * density + (1 - known) / (4 * np.pi)
+    nearness = np.exp(-square.min() / (2 * extent**2))
+    return nearness * density + (1 - nearness) / (4 * np.pi)
 
 
 def evaluate(hits, p, d):
