@@ -22,7 +22,6 @@ from .checks import (
     list_persons,
     to_source,
 )
-from .filters import argsort_by_person_time
 from .rays import Rays
 
 # ---- Participants or recordings in different frames ----
@@ -594,28 +593,6 @@ def _is_gaze_fixed(steps: WalkingSteps) -> bool:
         and lengths[1] < _MAX_HEADING_LENGTH
         and (np.abs(correlations) < _MIN_CORRELATION).all()
     )
-
-
-def correlate_gaze_with_walking(rays: Rays, order: np.ndarray | None = None) -> np.ndarray | None:
-    """Correlation of gaze and walking along each axis of the file.
-
-    Uses half-second steps at 0.3 to 3 m/s. People look ahead, so that correct directions give values far above zero
-    along each axis of walking. Sets of millions of rays are subsampled in runs of some thousands.
-
-    Parameters
-    ----------
-    rays
-        Rays of walking participants.
-    order
-        Order of the rays from `filters.argsort_by_person_time`, if already computed.
-
-    Returns
-    -------
-    numpy.ndarray or None
-        (3,), 0 along the up axis; None if there are too few steps.
-    """
-    steps = _find_walking_steps(rays, argsort_by_person_time(rays) if order is None else order)
-    return None if len(steps.heading) < _MIN_STEPS else _correlate_steps(steps)
 
 
 def _correlate_steps(steps: WalkingSteps) -> np.ndarray:

@@ -114,15 +114,6 @@ def find_up_axis(positions: np.ndarray) -> UpAxis | None:
     return preferred[0][0] if preferred else None
 
 
-def find_time_unit(times: np.ndarray) -> float | None:
-    """Find the unit of ``times`` (n,) in seconds that gives the sampling rate of a device; None if none does.
-
-    Steps of 166,667 are 60 Hz in ticks of 100 ns, but 6 Hz in microseconds: units that give a usual rate come first.
-    """
-    units = _find_time_units(times)
-    return units[0] if units else None
-
-
 def find_clock(times: np.ndarray) -> tuple[float, str] | None:
     """Find the unit in seconds and the name of a clock for which ``times`` (n,) are dates of this century."""
     median = np.median(times[np.isfinite(times)]) if np.isfinite(times).any() else np.nan
@@ -132,8 +123,11 @@ def find_clock(times: np.ndarray) -> tuple[float, str] | None:
     return None
 
 
-def _find_time_units(times: np.ndarray) -> list[float]:
-    """Units of ``times`` in seconds that give the sampling rate of a device, the most likely first."""
+def find_time_units(times: np.ndarray) -> list[float]:
+    """Return the units of ``times`` (n,) in seconds that give the sampling rate of a device, the most likely first.
+
+    Steps of 166,667 are 60 Hz in ticks of 100 ns, but 6 Hz in microseconds: units that give a usual rate come first.
+    """
     rate = _find_rate(times)
     units = [t for t in _TIME_UNITS if _DEVICE_RATES[0] <= rate / t <= _DEVICE_RATES[1]]
     return sorted(units, key=lambda t: rate / t < _USUAL_RATE)
@@ -704,7 +698,7 @@ def _find_time(out: Proposal, sample: TableSample, roles: Roles) -> tuple[str | 
         out.certain.append(f"{name!r} contains times of day, or dates with times (in UTC without an offset)")
         _question_rate(out, name, rate, "seconds")
         return name, times
-    named_unit, clock, units = parse_time_unit(name), find_clock(times), _find_time_units(times)
+    named_unit, clock, units = parse_time_unit(name), find_clock(times), find_time_units(times)
     if clock and units and not _is_plausible_rate(rate / clock[0]):
         clock = None  # the clock of a device that started some time ago, in another unit
     detected = clock[0] if clock else units[0] if units else None

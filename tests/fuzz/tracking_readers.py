@@ -143,9 +143,9 @@ def _make_parquet(path: Path) -> None:
 
 def _skeletons(name: str, *kinds: str) -> Reader:
     def read(folder: Path) -> None:
-        from nerg_mi.tracking.readers.skeleton import read_skeleton
+        from nerg_mi.tracking.readers.skeleton import iterate_skeleton
 
-        read_skeleton(folder / name)
+        list(iterate_skeleton(folder / name))
 
     return Reader(f"skeleton {name}", lambda folder: write_walk(folder / name), {name: kinds}, read)
 

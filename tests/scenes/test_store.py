@@ -213,7 +213,7 @@ def test_law_names_an_unknown_category():
 
 
 def test_shoppers_keep_clear_of_furniture_and_return_to_the_skeleton_file(store, law, tmp_path):
-    from nerg_mi.tracking.readers.skeleton import LEFT_EAR, NOSE, RIGHT_EAR, head_poses, read_skeleton
+    from nerg_mi.tracking.readers.skeleton import LEFT_EAR, NOSE, RIGHT_EAR, head_poses, iterate_skeleton
 
     ids, times, origins, directions = shoppers.simulate_shoppers(store, shoppers=3, stops=(2, 4), seed=5, law=law)
     again = shoppers.simulate_shoppers(store, shoppers=3, stops=(2, 4), seed=5, law=law)
@@ -227,7 +227,7 @@ def test_shoppers_keep_clear_of_furniture_and_return_to_the_skeleton_file(store,
     path = shoppers.write_shoppers(
         store, tmp_path / "s.csv", shoppers=3, stops=(2, 4), seed=5, law=law, log=lambda text: None
     )
-    rows = read_skeleton(path)
+    (rows,) = iterate_skeleton(path)
     o, d = head_poses(*(rows.keypoints[:, k] for k in (LEFT_EAR, RIGHT_EAR, NOSE)))
     assert np.array_equal(rows.ids, ids) and np.array_equal(rows.times, times)
     assert np.allclose(o, origins, atol=1e-4) and np.allclose(d, directions, atol=2e-3)

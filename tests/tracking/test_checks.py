@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from nerg_mi.tracking.checks import group_medians
-from nerg_mi.tracking.direction_checks import correlate_gaze_with_walking
 from nerg_mi.tracking.rays import FRAME
 from tests.tracking.people import change, walk, warnings_of, watch
 
@@ -217,4 +216,3 @@ def test_times_and_steep_gaze():
 
 def test_plausible_walk_has_no_warnings():
     assert warnings_of(walk()) == "" and warnings_of(walk(hit=False)) == ""
-    assert (correlate_gaze_with_walking(walk())[:2] > 0.5).all()

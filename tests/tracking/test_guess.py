@@ -465,18 +465,17 @@ def test_rows_without_evidence():
 @pytest.mark.parametrize("rate", [30.0, 50.0, 200.0, 1000.0])
 @pytest.mark.parametrize("tick", [1.0, 1e-3, 1e-6, 1e-9])
 def test_unit_of_time(rate, tick):
-    result = rows.find_time_unit(np.arange(100) / rate / tick)
     # At 11 to 2,100 Hz only one of two units a factor of thousand apart can match.
-    assert result == tick
-    assert rows.find_time_unit(np.zeros(9)) is None and rows.find_time_unit(np.array([1.0])) is None
-    assert rows.find_time_unit(np.arange(9) * 3.6e8) is None
+    assert rows.find_time_units(np.arange(100) / rate / tick)[0] == tick
+    assert rows.find_time_units(np.zeros(9)) == rows.find_time_units(np.array([1.0])) == []
+    assert rows.find_time_units(np.arange(9) * 3.6e8) == []
 
 
 @pytest.mark.parametrize("rate", [50.0, 72.0, 90.0, 120.0, 200.0])
 def test_ticks_of_100_ns_are_not_microseconds(rate):
-    assert rows.find_time_unit(np.arange(100) / rate / 1e-7) == 1e-7  # noqa: RUF069 (one of a table)
+    assert rows.find_time_units(np.arange(100) / rate / 1e-7)[0] == 1e-7  # noqa: RUF069 (one of a table)
     # At 11 Hz in milliseconds there is no other unit.
-    assert rows.find_time_unit(np.arange(100) / 11 / 1e-3) == 1e-3  # noqa: RUF069 (one of a table)
+    assert rows.find_time_units(np.arange(100) / 11 / 1e-3)[0] == 1e-3  # noqa: RUF069 (one of a table)
 
 
 @pytest.mark.parametrize(

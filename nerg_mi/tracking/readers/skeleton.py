@@ -209,14 +209,6 @@ def _report_bad_line(path: str | os.PathLike, line: int, reason: str, on_bad_lin
     on_bad_line(line, reason)
 
 
-def read_skeleton(path: str | os.PathLike, layout: Layout = PAPER_LAYOUT) -> SkeletonRows:
-    """Read all poses of a file; raises as :func:`iterate_skeleton` does."""
-    runs = list(iterate_skeleton(path, layout=layout))
-    if not runs:
-        raise NergError(f"{path} has no poses; expected lines id|time|[{layout.num_values} numbers]")
-    return SkeletonRows(*(np.concatenate(column) for column in zip(*runs)))
-
-
 def _parse_rows(
     path: str | os.PathLike,
     ids: list[str],
