@@ -150,7 +150,7 @@ def main(argv=None) -> list[dict]:
     args.out = args.out.resolve()
     args.out.mkdir(parents=True, exist_ok=True)
     select_backend("llvm_ad_rgb", args.threads)
-    (train, tests), rows = make_tests(nerg.load_rays(args.rays), args), []
+    (train, tests), rows = make_tests(nerg.Rays.load(args.rays), args), []
     centres = tests["test"].centres
     for recipe in args.recipes.split(","):
         # A prior would make the networks that are compared more alike.

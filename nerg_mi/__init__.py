@@ -64,7 +64,6 @@ if TYPE_CHECKING:
     from .reports.report import report
     from .surfaces.bake import bake
     from .surfaces.baked import draw_surface
-    from .tracking.dataset import load_rays
     from .tracking.imports import guess, import_rays
     from .tracking.measurement import measure_events
     from .tracking.quality import check_rays
@@ -122,7 +121,6 @@ _MODULES = {
     "guess": "nerg_mi.tracking.imports",
     "import_checkpoint": "nerg_mi.environment.conversion",
     "import_rays": "nerg_mi.tracking.imports",
-    "load_rays": "nerg_mi.tracking.dataset",
     "make_scene": "nerg_mi.environment.scene",
     "measure_events": "nerg_mi.tracking.measurement",
     "next_look": "nerg_mi.evaluation.next_look_scores",
@@ -186,7 +184,6 @@ __all__ = [
     "guess",
     "import_checkpoint",
     "import_rays",
-    "load_rays",
     "make_scene",
     "measure_events",
     "next_look",

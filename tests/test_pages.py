@@ -256,7 +256,7 @@ def test09_from_recordings(rgb, place, monkeypatch):
     """The block of trainings, whose inputs are a table of four people and photos of the store, with fewer steps."""
     import nerg_mi as nerg
 
-    rays = nerg.load_rays("day.npz")
+    rays = nerg.Rays.load("day.npz")
     names = [rays.persons[k] for k in rays.person]
     table = np.column_stack([rays.t, rays.origin, rays.direction])
     lines = [",".join(map(str, row)) + f",{who}" for row, who in zip(table, names)]

@@ -34,7 +34,7 @@ from nerg_mi.tasks.execution import prepare_once
 from nerg_mi.tasks.parts import PartRunner
 from nerg_mi.tasks.settings import Parallel
 from nerg_mi.tasks.task import RENDER_LIBRARIES, Part, Plan
-from nerg_mi.tracking.dataset import load_rays
+from nerg_mi.tracking.dataset import open_rays
 from nerg_mi.tracking.rays import Rays
 from nerg_mi.tracking.readers.columns import open_named_table
 from nerg_mi.transport.extrapolation import warn_extrapolation
@@ -351,7 +351,7 @@ def make_gaze_groups(
     """
     tracked = inputs.rays
     if tracked is not None and not isinstance(tracked, Rays):
-        tracked = load_rays(tracked, inputs.max_samples, inputs.seed)
+        tracked = open_rays(tracked, inputs.max_samples, inputs.seed)
     if tracked is not None and not len(tracked):
         raise NergError(f"the file of {parameter('rays')} contains no rays; name another one")
     if source == "field":

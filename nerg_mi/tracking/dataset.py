@@ -41,7 +41,7 @@ from nerg_mi.files.safe_read import (
     read_json,
     translate_read_errors,
 )
-from nerg_mi.files.values import FilePath, find_names, fold_name, to_name, to_path
+from nerg_mi.files.values import FilePath, find_names, fold_name, to_name
 
 from .filters import select_mask
 from .rays import (
@@ -760,41 +760,6 @@ def _rows_within(rows: np.ndarray, first: int, count: int) -> np.ndarray:
     return rows[np.searchsorted(rows, first) : np.searchsorted(rows, first + count)]
 
 
-def load_rays(path: str | os.PathLike, max_rays: int | None = None, seed: int = 0) -> Rays:
-    """Load recorded gaze samples.
-
-    Parameters
-    ----------
-    path : path
-        A file (.npz or .parquet) written by ``nerg rays import``, `import_rays` or `Rays.save`, a dataset (.rays), or a
-        partition of one (``shop.rays/place=north``).
-    max_rays : int, optional
-        Maximum number of samples of a dataset; larger datasets are sampled uniformly. Default: all, at most 50 million.
-    seed : int
-        Seed of that sample.
-
-    Returns
-    -------
-    Rays
-        The samples, right-handed with z up, in metres and seconds.
-
-    Raises
-    ------
-    NergError
-        The file does not exist or is damaged.
-
-    Examples
-    --------
-    >>> import nerg_mi as nerg
-    >>> rays = nerg.Rays(t=[0, 0.1], person=[0, 0], persons=("Ada",), origin=[[1, 1, 1.6]] * 2,
-    ...                  direction=[[1, 0, 0], [0, 1, 0]], confidence=[1, 1])
-    >>> rays.save(folder / "rays.npz")
-    >>> len(nerg.load_rays(folder / "rays.npz"))
-    2
-    """
-    return open_rays(to_path(path), max_rays, seed)
-
-
 def open_recordings(rays: Rays | RayDataset | FilePath) -> Rays | RayDataset:
     """Return rays and datasets unchanged, or open their file. Raises `NergError` for anything else."""
     if isinstance(rays, (Rays, RayDataset)):
@@ -808,7 +773,7 @@ def open_recordings(rays: Rays | RayDataset | FilePath) -> Rays | RayDataset:
 
 
 def open_rays(rays: Rays | RayDataset | FilePath, max_rays: int | None = None, seed: int = 0) -> Rays:
-    """Return rays unchanged, or load them from a file or a dataset, as `load_rays` does."""
+    """Return rays unchanged, or load them from a file or a dataset, as `Rays.load` does."""
     data = open_recordings(rays)
     if isinstance(data, Rays):
         return data

@@ -89,7 +89,7 @@ def concatenate(rays: Iterable[Rays]) -> Rays:
     for k, part in enumerate(parts):
         if not isinstance(part, Rays):
             raise NergError(
-                f"element {k} must be Rays, got {type(part).__name__}; files are read by load_rays, arrays by "
+                f"element {k} must be Rays, got {type(part).__name__}; files are read by Rays.load, arrays by "
                 "Rays.from_arrays"
             )
     # The frame of rays, and the transform from it to that of an environment.

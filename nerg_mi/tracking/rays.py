@@ -772,8 +772,41 @@ class Rays:
         write_rays_file(path, self.columns(), {**self.metadata, "persons": list(self.persons), **cohorts})
 
     @classmethod
-    def load(cls, path: str | os.PathLike) -> Rays:
-        """Read and validate a file of :meth:`save`. Raises `NergError` with the name of the file."""
+    def load(cls, path: str | os.PathLike, max_rays: int | None = None, seed: int = 0) -> Rays:
+        """Load recorded gaze samples.
+
+        Parameters
+        ----------
+        path : path
+            A file (.npz or .parquet) written by ``nerg rays import``, `import_rays` or `save`, a dataset (.rays), or a
+            partition of one (``shop.rays/place=north``).
+        max_rays : int, optional
+            Maximum number of samples of a dataset; larger datasets are sampled uniformly. Default: all, at most 50
+            million.
+        seed : int
+            Seed of that sample.
+
+        Returns
+        -------
+        Rays
+            The samples, right-handed with z up, in metres and seconds.
+
+        Raises
+        ------
+        NergError
+            The file does not exist or is damaged.
+
+        Examples
+        --------
+        >>> import nerg_mi as nerg
+        >>> rays = nerg.Rays(t=[0, 0.1], person=[0, 0], persons=("Ada",), origin=[[1, 1, 1.6]] * 2,
+        ...                  direction=[[1, 0, 0], [0, 1, 0]], confidence=[1, 1])
+        >>> rays.save(folder / "rays.npz")
+        >>> len(nerg.Rays.load(folder / "rays.npz"))
+        2
+        """
+        if os.path.isdir(path):
+            return _import("dataset").open_rays(path, max_rays, seed)
         columns, metadata = read_rays_file(path)
         persons, cohorts = metadata.pop("persons"), metadata.pop("cohorts", ())
         try:

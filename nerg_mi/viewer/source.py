@@ -27,7 +27,7 @@ from nerg_mi.formats.checkpoint import read_metadata
 from nerg_mi.formats.splats import READERS, is_splat_file
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.progress import SILENT, Reporter
-from nerg_mi.tracking.dataset import is_dataset, load_rays
+from nerg_mi.tracking.dataset import is_dataset, open_rays
 from nerg_mi.tracking.rays import Rays
 
 RAYS = 2_000_000
@@ -100,7 +100,7 @@ def open_viewer_scene(
             f'"{recordings[0]}" and "{recordings[1]}" are both rays, and the viewer shows one; leave out one of them'
         )
     rays = recordings[0] if recordings else None
-    rays = load_rays(rays, RAYS) if isinstance(rays, Path) else rays
+    rays = open_rays(rays, RAYS) if isinstance(rays, Path) else rays
     name = " + ".join(item.name if isinstance(item, Path) else find_role(item) for item in items)
     placed = None if align is None else open_similarity(align, "rays to place", reporter.warn)
     complete = _find_complete(environments[0], folder) if len(environments) == 1 else None

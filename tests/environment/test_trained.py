@@ -42,8 +42,8 @@ def test03_half_the_size(files, tmp_path, load, name):
         (nerg.RadianceField.load, "gaze.safetensors", "contains a gaze field"),
         (nerg.GazeField.load, "field.safetensors", "contains a radiance field"),
         (nerg.RadianceField.load, "nowhere.safetensors", "does not exist"),
-        (nerg.load_rays, "nowhere.npz", "nowhere.npz"),
-        (nerg.load_rays, "field.safetensors", "rays are saved"),
+        (nerg.Rays.load, "nowhere.npz", "nowhere.npz"),
+        (nerg.Rays.load, "field.safetensors", "rays are saved"),
     ],
 )
 def test04_errors_are_sentences(files, load, name, said):

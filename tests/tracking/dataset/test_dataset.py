@@ -14,7 +14,7 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import file_sha256
 from nerg_mi.tracking import dataset, dataset_write
-from nerg_mi.tracking.dataset import Conditions, RayDataset, hash_rays, is_dataset, load_rays, read_groups
+from nerg_mi.tracking.dataset import Conditions, RayDataset, hash_rays, is_dataset, read_groups
 from nerg_mi.tracking.dataset_write import update_dataset
 from nerg_mi.tracking.filters import select_mask
 from nerg_mi.tracking.quality import summarise, summarise_dataset
@@ -111,7 +111,7 @@ def test_tracking_is_that_of_the_selected_sources(tmp_path):
     update_dataset(tmp_path / "b.rays", [heads], recipe(settings=options, key=bytes(32)))
     assert RayDataset.open(tmp_path / "a.rays").load().tracking == "eye"
     dataset = RayDataset.open(tmp_path / "b.rays")
-    assert dataset.load().tracking == dataset.sample(10).tracking == load_rays(tmp_path / "b.rays").tracking == "head"
+    assert dataset.load().tracking == dataset.sample(10).tracking == Rays.load(tmp_path / "b.rays").tracking == "head"
     assert all(block.tracking == "head" for block in dataset.scan())
 
 
@@ -283,13 +283,13 @@ def test_files_and_datasets(tmp_path):
     dataset, rays = write_dataset(tmp_path)
     rays.save(tmp_path / "rays.npz")
     for path in (tmp_path / "rays.npz", dataset.folder, dataset.folder / "place=shop"):
-        assert_same(load_rays(path), rays)
+        assert_same(Rays.load(path), rays)
         assert is_dataset(path) is (path.suffix != ".npz")
     assert hash_rays(tmp_path / "rays.npz") == file_sha256(tmp_path / "rays.npz")
     assert hash_rays(dataset.folder) == dataset.digest
-    some = load_rays(dataset.folder, 100, seed=2)
-    assert np.array_equal(some.t, dataset.sample(100, 2).t) and len(load_rays(dataset.folder, 5000)) == len(rays)
-    assert len(load_rays(tmp_path / "rays.npz", 100)) == len(rays)
+    some = Rays.load(dataset.folder, 100, seed=2)
+    assert np.array_equal(some.t, dataset.sample(100, 2).t) and len(Rays.load(dataset.folder, 5000)) == len(rays)
+    assert len(Rays.load(tmp_path / "rays.npz", 100)) == len(rays)
 
 
 # ---- Quality report of a dataset: that of the same rays in a file, except for figures of a sample ----

@@ -6,7 +6,7 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation.held_out import evaluate_gaze
-from nerg_mi.tracking.dataset import load_rays
+from nerg_mi.tracking.dataset import open_rays
 from nerg_mi.train.gaze import train_gaze
 from tests.evaluation.test_gaze import crowd as evaluated_crowd
 from tests.evaluation.test_held_out import HELD_OUT, OPTIONS
@@ -36,7 +36,7 @@ def test_training_and_evaluation_use_the_same_rays(crowded, tmp_path, max_sample
     assert trained.provenance["test"]["rays"] == count and f"{count:,} rays of {crowded}" in heard.messages
     result = evaluate_gaze(gaze, crowded, **OPTIONS)
     # The same scores as for the rays in memory.
-    rays = load_rays(crowded, max_samples, 3)
+    rays = open_rays(crowded, max_samples, 3)
     alone = train_gaze(rays, "none", **HELD_OUT, seed=3, output=tmp_path / "alone.safetensors")
     assert alone.provenance["test"] == trained.provenance["test"]
     # The order in which two threads sum gradients varies, so two fits agree up to rounding only.
