@@ -147,7 +147,7 @@ def test_the_best_baseline_of_a_score_has_the_best_mean(benchmark):
     rows = {row[0]: row[1:] for row in latest("room")["rows"]}
     assert rows["KLD"][2:] == ["0.400", "nearest rays", "0.350", "0.500", "+0.150 ± 0.354", "+0.200, +0.100"]
     assert rows["CC"][2:4] == ["0.400", "position-independent prior"] and rows["CC"][-1] == "-0.300, +0.500"
-    assert latest("room")["columns"] == results.read("gaze-supermarket")["columns"]
+    assert latest("room")["columns"] == results.read("gaze-recorded")["columns"]
 
 
 SCRIPTS = sorted(p.stem for p in (ROOT / "benchmarks").glob("*.py") if "__main__" in p.read_text(encoding="utf-8"))
