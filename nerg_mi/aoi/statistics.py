@@ -54,6 +54,7 @@ from .predicted import (
 from .settings import AoiSampling, ObserverGrid, VisitRules
 from .statistics_parts import PartitionedStatistics, save_objects
 from .tables import (
+    MAX_COMPARED_VALUES,
     MEASURED,
     PREDICTED,
     MinParticipantsFilter,
@@ -364,6 +365,7 @@ class _Work:
                 if predicted_people is not None:
                     people[cell][PREDICTED] = predicted_people
         _report_small_groups(people, self.reporter)
+        _report_values_without_comparison(people, self.reporter)
         return _Attention(sums, viewpoints, predicted, people, times)
 
     def _count(self, rays: Rays | RayDataset, num_viewpoints: int) -> tuple[VisitSums, Viewpoints]:
@@ -482,6 +484,16 @@ class _Work:
         if not show_names:
             named = make_pseudonyms(persons, None if salt is None else read_salt(to_path(salt)))
         return ParticipantRows(sums, named, self.counting.aoi_visibility)
+
+
+def _report_values_without_comparison(people: Mapping[Cell, Mapping[str, Participants]], reporter: Reporter) -> None:
+    for dimension in dict.fromkeys(cell.dimension for cell in people):
+        values = [cell.value for cell in people if cell.dimension == dimension]
+        if len(values) > MAX_COMPARED_VALUES:
+            reporter.warn(
+                f"differences are those between the first {MAX_COMPARED_VALUES} of {len(values)} values of "
+                f'{dimension}; "{values[MAX_COMPARED_VALUES]}" and later ones are not compared'
+            )
 
 
 def _report_small_groups(people: Mapping[Cell, Mapping[str, Participants]], reporter: Reporter) -> None:

@@ -12,6 +12,7 @@ import pytest
 from nerg_mi.aoi import statistics as module
 from nerg_mi.aoi.settings import AoiSampling, VisitRules
 from nerg_mi.aoi.statistics import statistics
+from nerg_mi.aoi.tables import MAX_COMPARED_VALUES
 from nerg_mi.errors import NergError
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.formats.fields import load_gaze, save_gaze
@@ -118,6 +119,16 @@ def test03_windows_zones_and_cohorts_are_read_from_a_file(folder, tmp_path):
         mine = [on[mask & (rays.person == p)].mean() for p in np.unique(rays.person[mask])]
         assert row["share"] == pytest.approx(np.mean(mine)), (cell, value)
     assert {r["cell"] for r in result.differences} == {"window", "cohort"}
+
+
+def test_values_that_are_not_compared_are_named(folder):
+    recorder = Recorder()
+    windows = {f"w{k}": (k, k + 1) for k in range(MAX_COMPARED_VALUES + 1)}
+    scene = folder / "bare" / "scene.xml"
+    result = statistics([scene, people()], folder / "areas.json", windows=windows, progress=recorder, **NARROW)
+    last = f"w{MAX_COMPARED_VALUES}"
+    assert [text for text in recorder.warnings if f'"{last}"' in text]
+    assert last not in {row[key] for row in result.differences for key in ("first", "second")}
 
 
 def test_the_seed_sets_all_intervals(folder, tmp_path, monkeypatch):
