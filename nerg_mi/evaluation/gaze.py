@@ -619,7 +619,7 @@ def find_split_half_fault(participants: int, bits: float, low: float = math.nan)
         Lower end of its confidence interval over participants; NaN if unknown.
     """
     if participants < MIN_HALF_PARTICIPANTS:
-        return f"a half has {participants} participants, fewer than {MIN_HALF_PARTICIPANTS}"
+        return f"the smaller half has fewer than {MIN_HALF_PARTICIPANTS} participants: {participants}"
     if not (bits if math.isnan(low) else low) > 0:
         return f"its information gain over the prior, {bits:.2f} bits, does not exceed 0 with 95 % confidence"
     return ""

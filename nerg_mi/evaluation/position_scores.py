@@ -74,10 +74,14 @@ def format_verdicts(rows: list[dict[str, Any]]) -> list[str]:
     lines = []
     for kind in (RECORDED, AWAY):
         if (best := find_best(rows, kind)) is not None:
-            interval = f" [{best['bits.gap.low']:+.3f}, {best['bits.gap.high']:+.3f}]" if "bits.gap.low" in best else ""
+            interval = (
+                f" [{best['bits.gap.low']:+.3f}, {best['bits.gap.high']:+.3f}]"
+                if "bits.gap.low" in best
+                else " (no interval: fewer than 3 participants)"
+            )
             lines.append(
-                f"{kind} ({best['people']} participants): {best['bits.gap']:+.3f}{interval} bits per ray over the best "
-                f"baseline, {best['method']}"
+                f"{kind} ({best['people']} participants): {best['bits.gap']:+.3f}{interval} bits per sample over the "
+                f"best baseline, {best['method']}"
             )
     return lines
 

@@ -391,9 +391,10 @@ def _leave_out_views(
     views: tuple[SalienceView, ...], test: dict, distance: float, to_scene: Similarity, reporter: Reporter
 ) -> tuple[SalienceView, ...]:
     """Report what is held out, the record ``test``, and return the views farther than ``distance`` from it."""
+    participants = len(test["people"])
     reporter.message(
-        f"{len(test['centres'])} test positions held out, {test['rays_to_train']:,} of {test['rays']:,} rays remain "
-        "for training"
+        f"{len(test['centres'])} test positions and {participants} participant{'' if participants == 1 else 's'} held "
+        f"out, {test['rays_to_train']:,} of {test['rays']:,} rays remain for training"
     )
     centres = np.array(test["centres"]) @ to_scene.matrix[:3, :3].T + to_scene.matrix[:3, 3]
     return tuple(select_far_views(views, centres, distance * to_scene.scale))
@@ -414,8 +415,8 @@ def _make_environment(word: str, supervision: Supervision, voxel: float | None, 
     )
     if made["beyond"]:
         reporter.message(
-            f"{100 * made['beyond']:.1f} % of the hit points are outside this box and were moved to its boundary, "
-            "in their direction but too near"
+            f"{100 * made['beyond']:.1f} % of the hit points are outside this box: each was moved along its ray to "
+            "the boundary, nearer than recorded"
         )
     return environment
 
@@ -510,7 +511,7 @@ def _report_result(field: GazeField, reporter: Reporter) -> None:
             kind = "only" if m["mix"] == 1 else "mostly"
             reporter.warn(
                 f"position hardly predicts the gaze of other participants: the gaze field is {kind} the "
-                "position-independent prior; record more participants, or provide the geometry of the scene"
+                "position-independent prior; record more participants, or provide a model of the environment"
             )
     if field.path is not None:
         reporter.message(f"wrote {field.path} ({field.path.stat().st_size / 1e6:.2f} MB)")

@@ -50,6 +50,8 @@ def test_each_kind_has_baselines_of_its_own():
         assert best["bits.gap"] == best["bits.gap.low"] == best["bits.gap.high"] == pytest.approx(1)
     assert rows[0]["bits"] == pytest.approx(3) and rows[4]["bits"] == pytest.approx(2)
     assert [line.split(" (")[0] for line in format_verdicts(rows)] == [RECORDED, AWAY]
+    alone = [{key: value for key, value in row.items() if key not in ("bits.gap.low", "bits.gap.high")} for row in rows]
+    assert all("no interval" in line for line in format_verdicts(alone))
 
 
 def test_intervals_are_those_of_participants():

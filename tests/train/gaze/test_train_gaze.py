@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import fields, replace
 from types import SimpleNamespace
 
@@ -213,10 +214,8 @@ def test_held_out_positions_and_participants_are_reported(tmp_path):
     result = train_gaze(RAYS, "none", **QUICK, test_zones=2, test_positions=6, test_participants=0.5, progress=heard)
     test = result.provenance["test"]
     assert result.provenance["rays"] == test["rays_to_train"] < test["rays"] == len(RAYS) and len(test["people"]) == 1
-    assert (
-        heard.messages[0]
-        == f"6 test positions held out, {test['rays_to_train']:,} of {test['rays']:,} rays remain for training"
-    )
+    said = re.findall(r"[\d,]*\d", heard.messages[0])
+    assert said == ["6", "1", f"{test['rays_to_train']:,}", f"{test['rays']:,}"]
 
 
 def test_an_interrupted_training_stops_the_script_and_reports_how_to_resume(rays, tmp_path, single_thread):
