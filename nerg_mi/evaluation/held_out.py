@@ -210,9 +210,9 @@ def evaluate_gaze(
         tune = partial(make_tuned_baselines, train, account["radius"], hits, prior_kappa=prior_kappa, seed=seed)
         baselines = tune(participants=split != "pos", positions=split != "people")
         depth, count = training.get("probes", {}).get("depth", "median"), len(test.centres)
-        # Most of the time is spent on evaluating the field.
+        # Much of the time is spent on evaluating the field.
         report_position = lambda number: reporter.progress(
-            0.05 + 0.6 * min(number / count, 1), f"position {number} of {count}"
+            0.05 + 0.35 * min(number / count, 1), f"position {number} of {count}"
         )
         # All tables use the same densities.
         members = CachedBaseline(
@@ -222,7 +222,7 @@ def evaluate_gaze(
         methods = {_FIELD: field_density, **{name: CachedBaseline(b.density) for name, b in baselines.items()}}
         prior = methods[PRIOR_BASELINE]
         reporter.progress(0.05, "scores")
-        report_share = lambda share: reporter.progress(0.65 + 0.2 * share, "scores") if share > 0 else None
+        report_share = lambda share: reporter.progress(0.4 + 0.45 * share, "scores") if share > 0 else None
         rows = evaluation.score_methods(test, methods, prior, resamples, seed, report_share)
         half, half_note = evaluation.score_split_half(
             scored, test.centres, account["radius"], kappa, prior, min_rays, seed, resamples

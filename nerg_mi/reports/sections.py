@@ -98,9 +98,11 @@ GAZE = Section("gaze", "The gaze", _show_gaze, _explain_absent_gaze)
 
 # ---- Limits ----
 
-_LIMITS = (
+_LIMIT_OF_HEADS = (
     "Head direction is not gaze direction, because the eyes rotate in the head. A field trained on head directions "
-    "predicts head directions, and spreads attention too evenly over small AOIs.",
+    "predicts head directions, and spreads attention too evenly over small AOIs."
+)
+_LIMITS = (
     "The scene is static. Objects that were moved, restocked or removed on other days are shown as they were when the "
     "scene was captured.",
     "Surfaces are off by a few centimetres along edges. Gaze that passes close to an edge may be assigned to the "
@@ -113,7 +115,8 @@ _LIMITS = (
 
 def _show_limits(run: Run) -> Html:
     """List the limits."""
-    return element("ul", [element("li", text) for text in _LIMITS])
+    limits = _LIMITS if read_tracking(run.provenance) == "eye" else (_LIMIT_OF_HEADS, *_LIMITS)
+    return element("ul", [element("li", text) for text in limits])
 
 
 LIMITS = Section("limits", "Limits", _show_limits)
@@ -240,9 +243,10 @@ def _nearby_text(run: Run) -> list[str]:
     )
     if not num_single:
         return [f"{sentence} {middle}; no viewpoint has fewer than two."]
+    have = "viewpoint has" if num_single == 1 else "viewpoints have"
     return [
-        f"{sentence} {middle}; {num_single} viewpoints have only one. Near such a viewpoint the field reproduces "
-        "the gaze of a single participant."
+        f"{sentence} {middle}; {num_single} {have} only one. Near such a viewpoint the field reproduces the gaze of a "
+        "single participant."
     ]
 
 

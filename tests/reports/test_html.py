@@ -16,7 +16,7 @@ import pytest
 from nerg_mi.files import html
 from nerg_mi.reports.charts import Point, interval_chart, nice_ticks
 from nerg_mi.reports.data import RAYS
-from nerg_mi.reports.sections import SECTIONS, SETTINGS, render_page
+from nerg_mi.reports.sections import LIMITS, SECTIONS, SETTINGS, render_page
 from nerg_mi.tracking.rays import TRACKING
 from tests.reports.made import HOSTILE, PNG, full_run, minimal_run, packed_scene
 
@@ -184,6 +184,11 @@ def test_empty_sections_state_a_reason(section):
         assert section.render(minimal_run())
     else:
         assert reason.endswith(".") and len(reason) > 40 and reason.count(".") <= 2
+
+
+def test_limits_of_heads_are_not_those_of_eyes():
+    of = lambda tracking: text_of(LIMITS, replace(full_run(), provenance={"tracking": tracking}))
+    assert "eads" not in of("eye") and all("directions" in of(kind) for kind in ("head", "mixed", "unknown"))
 
 
 def test_section_names_and_titles_are_unique():
