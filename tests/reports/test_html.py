@@ -187,7 +187,9 @@ def test_empty_sections_state_a_reason(section):
 
 
 def test_limits_of_heads_are_not_those_of_eyes():
-    of = lambda tracking: text_of(LIMITS, replace(full_run(), provenance={"tracking": tracking}))
+    run = full_run()
+    training = lambda tracking: {**run.gaze, "provenance": {"tracking": tracking}}
+    of = lambda tracking: text_of(LIMITS, replace(run, gaze=training(tracking)))
     assert "eads" not in of("eye") and all("directions" in of(kind) for kind in ("head", "mixed", "unknown"))
 
 
