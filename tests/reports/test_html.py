@@ -189,8 +189,8 @@ def test_empty_sections_state_a_reason(section):
 def test_limits_of_heads_are_not_those_of_eyes():
     run = full_run()
     training = lambda tracking: {**run.gaze, "provenance": {"tracking": tracking}}
-    of = lambda tracking: text_of(LIMITS, replace(run, gaze=training(tracking)))
-    assert "eads" not in of("eye") and all("directions" in of(kind) for kind in ("head", "mixed", "unknown"))
+    limits = lambda tracking: text_of(LIMITS, replace(run, gaze=training(tracking)))
+    assert "eads" not in limits("eye") and all("directions" in limits(kind) for kind in ("head", "mixed", "unknown"))
 
 
 def test_section_names_and_titles_are_unique():
