@@ -328,8 +328,8 @@ class FoldDensities(NamedTuple):
     densities: np.ndarray
     field_maps: np.ndarray  # Of the field in D directions of equal area (n, D)
     prior_maps: np.ndarray  # Of the prior (n, D)
-    # Maps (m, D) of the density of re-aimed hits with these kernels at the first m rays
-    make_hit_maps: Callable[[Sequence[HitKernel], int], np.ndarray]
+    # Maps (m, D) of the density of re-aimed hits with these kernels at some of the rays
+    make_hit_maps: Callable[[Sequence[HitKernel], slice], np.ndarray]
     train_fraction: float = 1.0  # Fraction of the rays on which the field was trained
 
 
@@ -516,8 +516,8 @@ def _evaluate_fold(
     if plan.settings.reaimed_hits:
         columns.append(make_hits(train, geometry, ALL_HIT_KERNELS).evaluate_kernels(positions, directions[:, -1]))
 
-    def make_hit_maps(kernels: Sequence[HitKernel], count: int) -> np.ndarray:
-        return make_hits(train, geometry, kernels).observe(positions[:count], ns).evaluate(directions[:count, :-1])
+    def make_hit_maps(kernels: Sequence[HitKernel], rows: slice) -> np.ndarray:
+        return make_hits(train, geometry, kernels).observe(positions[rows], ns).evaluate(directions[rows, :-1])
 
     densities = np.concatenate(columns, axis=1)
     return FoldDensities(test.person, densities, field[:, :-1], prior[:, :-1], make_hit_maps, fold.train_fraction)
@@ -554,10 +554,12 @@ def _calibrate_regions(folds: Sequence[FoldDensities], selection: PriorSelection
     for fold in folds:
         weights = _to_weights(selection, fold)
         maps = weights[0] * fold.field_maps + weights[1] * fold.prior_maps
+        # The rays are in the order of the recording: every n-th, so that they are those of all participants.
+        rows = slice(None, None, -(-len(maps) // _MAX_HIT_MAPS) if selection.hits else 1)
+        maps = maps[rows]
         if selection.hits:
-            count = min(_MAX_HIT_MAPS, len(maps))
-            maps = maps[:count] + selection.hits_weight * fold.make_hit_maps(selection.hits, count)
-        levels.append(compute_region_levels(maps, (fold.densities[: len(maps)] @ weights)[:, None])[:, 0])
+            maps = maps + selection.hits_weight * fold.make_hit_maps(selection.hits, rows)
+        levels.append(compute_region_levels(maps, (fold.densities[rows] @ weights)[:, None])[:, 0])
     return calibrate_levels(np.concatenate(levels), np.ones(sum(map(len, levels))))
 
 

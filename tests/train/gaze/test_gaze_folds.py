@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.fields.gaze_hits import FAR
+from nerg_mi.fields.gaze_hits import FAR, HitKernel
 from nerg_mi.formats.checkpoint import read_checkpoint, write_checkpoint
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.tracking.rays import Rays
@@ -89,7 +89,7 @@ def plan_of(**changes):
 def make_fold(person, field, prior, field_maps, prior_maps, hits=None, hit_maps=None):
     """Densities of a fold; ``hits`` (n, C) and ``hit_maps`` (n, D) are those of re-aimed hits."""
     densities = np.column_stack([field, prior, *([] if hits is None else [hits])])
-    return FoldDensities(person, densities, field_maps, prior_maps, lambda kernels, count: hit_maps[:count])
+    return FoldDensities(person, densities, field_maps, prior_maps, lambda kernels, rows: hit_maps[rows])
 
 
 def test02_the_best_weight_is_selected_where_the_field_is_clearly_better():
@@ -229,6 +229,17 @@ def test07_regions_are_those_of_the_mixture():
     np.testing.assert_allclose([result[k] for k in ("50%", "80%", "95%")], [0.55 / 1.1, 0.9 / 1.1, 0.9 / 1.1])
     # The prior alone prefers the third direction, and the second as much as the direction without rays.
     np.testing.assert_allclose(_calibrate_regions([fold], PriorSelection(1.0, 1))["50%"], 1 - 0.5 * (0.2 + 0.2) / 0.8)
+
+
+def test07b_regions_are_those_of_all_participants():
+    """Of two participants in the order of the recording, one looks at the peaks and the other where nobody does."""
+    count, size = 300, len(HIT_KERNELS)
+    person = np.repeat([0, 1], count // 2)
+    maps = np.tile(np.linspace(0, 1, 50), (count, 1))
+    at_rays = np.where(person == 0, 1.0, 0.0)
+    fold = make_fold(person, at_rays, at_rays, maps, maps, np.tile(at_rays[:, None], (1, size)), maps)
+    regions = _calibrate_regions([fold], PriorSelection(0.1, 1, hits=(HitKernel(0.2, *HIT_KERNELS[0]),)))
+    assert regions["50%"] < 0.2 and regions["80%"] > 0.9
 
 
 # ---- Variants ----
