@@ -398,7 +398,7 @@ def test_every_setting_reaches_the_plan():
 
 
 def test_views_near_test_positions_are_left_out_in_scene_units():
-    test = {"centres": [[1.0, 2.0, 1.5]], "rays_to_train": 5, "rays": 9}
+    test = {"centres": [[1.0, 2.0, 1.5]], "rays_to_train": 5, "rays": 9, "people": []}
     near, far = (SimpleNamespace(camera=SimpleNamespace(center=np.array([10.0, 20, 15 + z]))) for z in (9.0, 11.0))
     scaled = Similarity(np.diag([10.0, 10, 10, 1]))
     assert module._leave_out_views((near, far), test, 1.0, scaled, Listener()) == (far,)
