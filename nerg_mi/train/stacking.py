@@ -14,7 +14,7 @@ _RAYS_PER_PARTICIPANT = 5.0  # Independent rays that a participant counts as
 _NUM_PSEUDO_RAYS = 5.0
 # Fractions of the pseudo-rays; that of the hits is divided between their kernels
 _FIELD, _PRIOR, _HITS = 0.85, 0.10, 0.05
-MAX_KERNELS = 6  # Maximum number of kernels of re-aimed hits in a mixture, because each costs time
+MAX_STACKED = 6  # Maximum number of kernels of re-aimed hits in a mixture, because each costs time
 _MIN_WEIGHT = 0.02  # Minimum weight of a kernel, for the same reason
 _NEGLIGIBLE_WEIGHT = 0.002  # Weight below which a kernel leaves at once
 _MAX_ITERATIONS, _TOLERANCE = 2000, 1e-6
@@ -64,8 +64,8 @@ def fit_sparse_weights(log_densities: np.ndarray, participant: np.ndarray) -> np
     fitted = fit()
     # One by one, because the weight of a kernel moves to those that resemble it, and the largest ones may all be alike;
     # kernels that hardly count leave at once.
-    while len(hits) > MAX_KERNELS:
-        is_kept = fitted[2:] >= min(_NEGLIGIBLE_WEIGHT, np.partition(fitted[2:], -MAX_KERNELS)[-MAX_KERNELS])
+    while len(hits) > MAX_STACKED:
+        is_kept = fitted[2:] >= min(_NEGLIGIBLE_WEIGHT, np.sort(fitted[2:])[-MAX_STACKED])
         is_kept[fitted[2:].argmin()] = False
         hits, start = hits[is_kept], fitted[np.concatenate([[True, True], is_kept])]
         fitted = fit(start)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from nerg_mi.train.stacking import MAX_KERNELS, fit_sparse_weights, fit_weights
+from nerg_mi.train.stacking import MAX_STACKED, fit_sparse_weights, fit_weights
 
 
 def test_weights_maximise_the_penalised_likelihood():
@@ -47,7 +47,7 @@ def test_few_kernels_have_weight():
     assert set(np.flatnonzero(fit_sparse_weights(alike, participant))) > {0, 1, 30}
     # Many equal kernels that are better than the rest, and none
     equal = np.where(np.arange(38)[:, None] < 2, -2.0, 0.0) * np.ones(800)
-    assert np.count_nonzero(fit_sparse_weights(equal, participant)) == 2 + MAX_KERNELS
+    assert np.count_nonzero(fit_sparse_weights(equal, participant)) == 2 + MAX_STACKED
     useless = np.where(np.arange(38)[:, None] < 2, 0.0, -9.0) * np.ones(800)
     assert np.flatnonzero(fit_sparse_weights(useless, participant)).tolist() == [0, 1]
     assert np.flatnonzero(fit_sparse_weights(log[:2], participant)).tolist() == [0, 1]
