@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -207,8 +206,9 @@ class _Builder:
     def add(self, item: Any, name: str) -> None:
         """Add an input, in memory or as a file."""
         if isinstance(item, Bake):
-            with tempfile.TemporaryDirectory() as folder:
-                self._add_meshes(_read_mesh(item.save(Path(folder) / "surface.ply"), name))
+            colors = decode_srgb(item.content.vertex_colors())
+            mesh = item.mesh
+            self._add_meshes(ExchangeMesh(name, mesh.vertices, mesh.faces, colors, item.density, item.content.unit))
             return
         item = item.splats if isinstance(item, SplatBake) else item
         role = find_role(item)

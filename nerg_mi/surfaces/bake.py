@@ -87,6 +87,11 @@ class BakeOutput:
         """Return the share of the gaze (F',) on each face of the target surface as given."""
         return np.bincount(self.refined.parent, self.share, len(self.receivers.mesh.faces))
 
+    def vertex_colors(self) -> np.ndarray:
+        """Return sRGB colours (V, 3) of the vertices of ``refined``: heat map over a grey shaded by the normal."""
+        shade = 0.75 + 0.25 * vertex_normals(self.refined.mesh) @ np.array([0.48, 0.36, 0.8])
+        return _shown(self.heat, self.density, shade)
+
 
 def write_output(baked: BakeOutput, path: Path, pixels: int | None) -> None:
     """Write ``baked`` to ``path`` in the format of its suffix, with a texture of ``pixels`` per side, or none."""
@@ -95,7 +100,7 @@ def write_output(baked: BakeOutput, path: Path, pixels: int | None) -> None:
 
 def _ply(baked: BakeOutput, path: Path, pixels: int | None) -> None:
     mesh, normals = baked.refined.mesh, vertex_normals(baked.refined.mesh)
-    colors = np.rint(255 * _colors(baked, baked.density, normals)).astype(np.uint8)
+    colors = np.rint(255 * baked.vertex_colors()).astype(np.uint8)
     names = ("x", "y", "z", "nx", "ny", "nz", "red", "green", "blue")
     columns: dict[str, np.ndarray] = dict(zip(names, [*mesh.vertices.T, *normals.T, *colors.T]))
     columns["value"] = baked.density
@@ -109,7 +114,7 @@ def _glb(baked: BakeOutput, path: Path, pixels: int | None) -> None:
     normals = vertex_normals(mesh)
     if pixels is None:
         rgba = np.full((len(mesh.vertices), 4), 65535, "<u2")
-        rgba[:, :3] = np.rint(65535 * decode_srgb(_colors(baked, baked.density, normals)))
+        rgba[:, :3] = np.rint(65535 * decode_srgb(baked.vertex_colors()))
         attributes: list[Attribute] = [
             ("POSITION", mesh.vertices.astype("<f4"), False),
             ("NORMAL", normals.astype("<f4"), False),
@@ -161,12 +166,6 @@ def vertex_normals(mesh: Mesh) -> np.ndarray:
     sums = np.stack([np.bincount(mesh.faces.ravel(), np.repeat(c, 3), len(mesh.vertices)) for c in weighted.T], axis=1)
     length = np.linalg.norm(sums, axis=1, keepdims=True)
     return np.where(length > 0, sums / np.where(length > 0, length, 1), [0.0, 0.0, 1.0])
-
-
-def _colors(baked: BakeOutput, values: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Return sRGB colours (V, 3) of vertices: heat map over a grey that is shaded by the normal."""
-    shade = 0.75 + 0.25 * normals @ np.array([0.48, 0.36, 0.8])
-    return _shown(baked.heat, values, shade)
 
 
 def _shown(heat: Heat, values: np.ndarray, shade: np.ndarray | float = 1.0) -> np.ndarray:
