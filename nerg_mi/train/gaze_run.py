@@ -16,7 +16,6 @@ from nerg_mi.errors import NergError, parameter, sanitize
 from nerg_mi.fields.gaze_base import GazeHead, summarize_provenance
 from nerg_mi.files.schema import INDEX, Items, check_json
 from nerg_mi.formats.checkpoint import read_checkpoint, write_checkpoint
-from nerg_mi.interruption import Interruption
 from nerg_mi.maths.geometry import AnyBox
 
 from .gaze_data import (
@@ -233,31 +232,28 @@ def fit_with_validation(
     out = GazeFit.from_dict(file.validation_state, trainer, file.restore("fit", trainer))
     out.schedule = settings.steps or 0
     evaluation_times, last_scores = np.arange(1, settings.num_validations + 1) / settings.num_validations, out.scores
-    with Interruption() as stop:
-        while (
-            trainer.progress < 1
-            and not out.interrupted
-            and not (settings.patience and out.evaluations_since_best >= settings.patience)
-        ):
-            trainer.step()
-            if validation is not None and trainer.progress >= evaluation_times[out.next_evaluation]:
-                out.next_evaluation = min(
-                    int(np.searchsorted(evaluation_times, trainer.progress, "right")), len(evaluation_times) - 1
-                )
-                last_scores = trainer.evaluate(validation)
-                out.history.append({"steps": trainer.steps, **round_scores(last_scores)})
-                out.evaluations_since_best += 1
-                if out.scores is None or np.isnan(out.scores.loss) or last_scores.loss < out.scores.loss:
-                    out.weights, out.best_step, out.scores, out.evaluations_since_best = (
-                        trainer.copy_weights(),
-                        trainer.steps,
-                        last_scores,
-                        0,
-                    )
-            file.save("fit", trainer, out.to_dict(), out.weights)
-            out.interrupted = _is_interrupted(
-                stop, on_progress, GazeProgress("fit", trainer.progress, trainer.steps, trainer.seconds, last_scores)
+
+    def is_done() -> bool:
+        return trainer.progress >= 1 or bool(settings.patience and out.evaluations_since_best >= settings.patience)
+
+    def after_step() -> None:
+        nonlocal last_scores
+        if validation is not None and trainer.progress >= evaluation_times[out.next_evaluation]:
+            out.next_evaluation = min(
+                int(np.searchsorted(evaluation_times, trainer.progress, "right")), len(evaluation_times) - 1
             )
+            last_scores = trainer.evaluate(validation)
+            out.history.append({"steps": trainer.steps, **round_scores(last_scores)})
+            out.evaluations_since_best += 1
+            if out.scores is None or np.isnan(out.scores.loss) or last_scores.loss < out.scores.loss:
+                out.weights, out.best_step = trainer.copy_weights(), trainer.steps
+                out.scores, out.evaluations_since_best = last_scores, 0
+        file.save("fit", trainer, out.to_dict(), out.weights)
+
+    def report() -> None:
+        on_progress(GazeProgress("fit", trainer.progress, trainer.steps, trainer.seconds, last_scores))
+
+    out.interrupted = trainer.run(is_done, after_step, report)
     if out.interrupted:
         file.save("fit", trainer, out.to_dict(), out.weights, force=True)
     if validation is not None and out.scores is None and trainer.steps:
@@ -283,31 +279,16 @@ def refit(
     settings = replace(plan.settings, steps=first.best_step, minutes=None)
     trainer = plan.trainer(targets, box, plan.config, settings, ns, first.schedule, plan.initial_arrays)
     file.restore("refit", trainer)
-    interrupted = False
-    with Interruption() as stop:
-        while trainer.steps < first.best_step and not interrupted:
-            trainer.step()
-            file.save("refit", trainer, first.to_dict(), {})
-            fraction = trainer.steps / first.best_step
-            interrupted = _is_interrupted(
-                stop, on_progress, GazeProgress("refit", fraction, trainer.steps, trainer.seconds, first.scores)
-            )
+    interrupted = trainer.run(
+        lambda: trainer.steps >= first.best_step,
+        lambda: file.save("refit", trainer, first.to_dict(), {}),
+        lambda: on_progress(
+            GazeProgress("refit", trainer.steps / first.best_step, trainer.steps, trainer.seconds, first.scores)
+        ),
+    )
     if interrupted:
         file.save("refit", trainer, first.to_dict(), {}, force=True)
     return GazeFit(trainer, trainer.copy_weights(), trainer.steps, first.schedule, first.scores, [], interrupted)
-
-
-def _is_interrupted(stop: Interruption, tell: ProgressCallback, progress: GazeProgress) -> bool:
-    """Report ``progress`` and return whether Ctrl-C was pressed.
-
-    Ctrl-C is only handled here, because within a step weights and random numbers are inconsistent.
-    """
-    try:
-        tell(progress)
-        stop.check()
-    except KeyboardInterrupt:
-        return True
-    return False
 
 
 def round_scores(scores: Scores) -> dict[str, float]:

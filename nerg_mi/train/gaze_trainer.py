@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from types import ModuleType
@@ -170,7 +170,7 @@ class Scores(NamedTuple):
     integral: float
 
 
-class GazeTrainer(Trainer, ABC):
+class GazeTrainer(Trainer):
     """Base class of gaze trainers; each kind of field has a subclass.
 
     Parameters

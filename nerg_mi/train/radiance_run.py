@@ -18,7 +18,6 @@ from nerg_mi.errors import NergError, clean_text, parameter
 from nerg_mi.fields.radiance import EMPTY, RadianceConfig, RadianceNetwork
 from nerg_mi.files.schema import INDEX, NUMBER, Items, Number, check_json
 from nerg_mi.formats.checkpoint import read_checkpoint, write_checkpoint
-from nerg_mi.interruption import Interruption
 from nerg_mi.maths.color import color_corrected_psnr, mean_ignoring_nan, psnr
 from nerg_mi.maths.geometry import Box
 from nerg_mi.photos.cameras import pixel_directions
@@ -280,10 +279,7 @@ def train_field(
     }
     history = load_run(trainer, state, identity) if resume else []
     last_psnr = history[-1]["psnr"] if history else None
-    # Not from the present progress: an evaluation that has come due may be postponed (`MIN_EVALUATION_INTERVAL`).
-    evaluated = trainer.progress_at(history[-1]["steps"], history[-1]["seconds"]) if history else 0.0
-    evaluation_times = [x for x in _EVALUATION_TIMES if x > evaluated] if watched.held_out else []
-    last_evaluation, saved, interrupted = history[-1]["steps"] if history else 0, trainer.seconds, False
+    evaluations, saved, interrupted = _EvaluationTimes(trainer, watched, history), trainer.seconds, False
     previews = PreviewWriter(preview, watched.held_out[0]) if preview is not None and watched.held_out else None
 
     def save() -> None:
@@ -300,40 +296,37 @@ def train_field(
     pace = Pace(trainer)
     if observer is not None:
         observer.on_start(trainer, dataset)
-    with Interruption() as stop:
-        while trainer.progress < 1 and not interrupted:
-            trainer.step()
-            if (line := pace.judge()) is not None:
-                on_warning(line)
-            if (
-                evaluation_times
-                and trainer.progress >= evaluation_times[0]
-                and trainer.steps >= last_evaluation + MIN_EVALUATION_INTERVAL
-            ):
-                evaluation_times, last_evaluation = [x for x in evaluation_times if x > trainer.progress], trainer.steps
-                with budget.timing_evaluation([*watched.held_out, *watched.training]) as strides:
-                    row = _append_evaluation(trainer, watched, history)
-                    strides += [] if row is None else [row["every_pixel"]]
-                last_psnr = history[-1]["psnr"] if history else None
-                with saving_on_failure(state, save, is_done=False):
-                    if curves is not None and history:
-                        write_curves_table(curves, history)
-                    if previews is not None:
-                        previews.write_if_affordable(trainer)
-            if state is not None and trainer.seconds - saved > save_every:
-                save()
-                saved = trainer.seconds
-            if observer is not None:
-                observer.on_step(trainer, history)
-            try:
-                if (line := budget.update()) is not None:
-                    on_warning(line)
-                report()
-                stop.check()
-            except KeyboardInterrupt:
-                # Ctrl-C is only handled between two steps, because within a step weights and random numbers are
-                # inconsistent.
-                interrupted = True
+
+    def evaluate() -> None:
+        nonlocal last_psnr
+        with budget.timing_evaluation([*watched.held_out, *watched.training]) as strides:
+            row = _append_evaluation(trainer, watched, history)
+            strides += [] if row is None else [row["every_pixel"]]
+        last_psnr = history[-1]["psnr"] if history else None
+        with saving_on_failure(state, save, is_done=False):
+            if curves is not None and history:
+                write_curves_table(curves, history)
+            if previews is not None:
+                previews.write_if_affordable(trainer)
+
+    def after_step() -> None:
+        nonlocal saved
+        if (line := pace.judge()) is not None:
+            on_warning(line)
+        if evaluations.take_due():
+            evaluate()
+        if state is not None and trainer.seconds - saved > save_every:
+            save()
+            saved = trainer.seconds
+        if observer is not None:
+            observer.on_step(trainer, history)
+
+    def update_budget() -> None:
+        if (line := budget.update()) is not None:
+            on_warning(line)
+        report()
+
+    interrupted = trainer.run(lambda: trainer.progress >= 1, after_step, update_budget)
     seconds = trainer.seconds
     if interrupted:
         save()
@@ -366,6 +359,24 @@ def train_field(
             report("writing", 1.0)
             write(field, provenance)
     return field, provenance
+
+
+class _EvaluationTimes:
+    """Times at which a run is evaluated, `_EVALUATION_TIMES`, as far as they follow the evaluations of ``history``."""
+
+    def __init__(self, trainer: RadianceTrainer, watched: WatchedViews, history: list):
+        self._trainer, self._last_step = trainer, history[-1]["steps"] if history else 0
+        # Not from the present progress: an evaluation that has come due may be postponed (`MIN_EVALUATION_INTERVAL`).
+        done = trainer.progress_at(history[-1]["steps"], history[-1]["seconds"]) if history else 0.0
+        self._left = [x for x in _EVALUATION_TIMES if x > done] if watched.held_out else []
+
+    def take_due(self) -> bool:
+        """Return whether an evaluation is due, and start to wait for the next one."""
+        steps, progress = self._trainer.steps, self._trainer.progress
+        if not self._left or progress < self._left[0] or steps < self._last_step + MIN_EVALUATION_INTERVAL:
+            return False
+        self._left, self._last_step = [x for x in self._left if x > progress], steps
+        return True
 
 
 class Pace:

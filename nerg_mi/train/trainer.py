@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,7 +18,7 @@ from nerg_mi.errors import NergError, parameter
 from nerg_mi.files.safe_read import translate_read_errors
 from nerg_mi.files.schema import Items, Number, check_json
 from nerg_mi.formats.fields import read_number
-from nerg_mi.interruption import Interrupted
+from nerg_mi.interruption import Interrupted, Interruption
 
 from .radiance_settings import RunSettings
 
@@ -30,7 +31,7 @@ def learning_rate_at(settings: RunSettings, progress: float) -> float:
     return settings.learning_rate * settings.lr_final_ratio ** min(late, 1.0)
 
 
-class Trainer:
+class Trainer(ABC):
     """Base class of a training run: optimiser, averaged weights (the result) and clock.
 
     ``schedule`` is the number of steps that the learning-rate schedule spans, if it differs from the length of the run.
@@ -83,6 +84,27 @@ class Trainer:
         The rest of the schedule is spread over the rest of the time, so that its progress neither jumps nor falls.
         """
         self._reserved_at, self.reserved_seconds = (self.seconds, self.progress), seconds
+
+    @abstractmethod
+    def step(self) -> None:
+        """Run one optimisation step."""
+
+    def run(self, is_done: Callable[[], bool], after_step: Callable[[], None], report: Callable[[], object]) -> bool:
+        """Run steps until ``is_done``, and return whether Ctrl-C ended the run before.
+
+        ``after_step`` evaluates and stores the run, and ``report`` may raise `KeyboardInterrupt` to end it. Ctrl-C is
+        handled between two steps only, because within a step weights and random numbers are inconsistent.
+        """
+        with Interruption() as stop:
+            while not is_done():
+                self.step()
+                after_step()
+                try:
+                    report()
+                    stop.check()
+                except KeyboardInterrupt:
+                    return True
+        return False
 
     def average_weights(self) -> None:
         """Update the exponential moving average of the weights."""
