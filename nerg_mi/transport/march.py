@@ -17,15 +17,17 @@ from .march_primal import (
     MarchSettings,
     MarchSums,
     OcclusionQuery,
+    Step,
+    StepState,
     march_hits,
     march_primal,
-    next_step,
+    march_steps,
     optical_depth_limits,
     position_before,
     zero_sums,
 )
 from .medium import Hits, LastHit, LocalRay, Medium, SampleShader
-from .quadrature import RULES, absorbed_fraction, cells_for_rule
+from .quadrature import absorbed_fraction
 from .splat_lists import SplatLists
 
 # ---- Derivatives of a march in steps ----
@@ -61,14 +63,15 @@ def march_differentiably(
 
 @dataclass(kw_only=True)
 class _Replay(MarchSums):
-    """The part of the primal loop state that the derivative march repeats."""
+    """The sums of the primal march that the derivative march repeats, and the rays that go on."""
 
     active: Bool
     color: Color
-    # Start of the next step, and its length as a fraction of a full one; of a march from hit to hit: the next hit.
-    t: Float | None = None
-    fraction: Float | None = None
-    index: UInt32 | None = None
+
+
+@dataclass(kw_only=True)
+class _StepReplay(StepState, _Replay):
+    """Loop state of the derivatives of a march in steps."""
 
 
 @dataclass
@@ -109,11 +112,11 @@ class MarchOp(dr.CustomOp):
         adjoint: Any = self.grad_out()
         d_half = dr.select(dr.isfinite(primal.median_depth), adjoint.median_depth, 0)
 
-        def body(state, grads):
+        def visit(state, place, grads):
             with dr.resume_grad():
                 leaves = [dr.detach(x) for x in self.inputs]
                 dr.enable_grad(leaves)
-                step, state = self._replay(leaves, state)
+                step, state = self._replay(leaves, state, place)
                 arriving = adjoint.moment * step.mean_distance
                 behind = adjoint.moment * (primal.moment - state.moment)
                 if color is not None:
@@ -130,7 +133,7 @@ class MarchOp(dr.CustomOp):
             return state, grads
 
         zeros = [dr.zeros(type(x), dr.width(x)) for x in self.inputs]
-        for name, g in zip(_INPUTS, self._march_again(body, zeros)):
+        for name, g in zip(_INPUTS, self._march_again(visit, zeros)):
             self.set_grad_in(name, g)
 
     def forward(self):
@@ -138,13 +141,13 @@ class MarchOp(dr.CustomOp):
         tangents = [self.grad_in(name) for name in _INPUTS]
         Float = type(self.inputs[3])
 
-        def body(state, dot):
+        def visit(state, place, dot):
             with dr.resume_grad():
                 leaves = [dr.detach(x) for x in self.inputs]
                 dr.enable_grad(leaves)
                 for leaf, tangent in zip(leaves, tangents):
                     dr.set_grad(leaf, tangent)
-                step, state = self._replay(leaves, state)
+                step, state = self._replay(leaves, state, place)
                 # The weight of the step, and its contribution to the sums at fixed T_i.
                 weight = step.transmittance * absorbed_fraction(step.dtau)
                 outputs = [
@@ -170,47 +173,38 @@ class MarchOp(dr.CustomOp):
                 dot, tau=dot.tau + tangents_of_step[0], moment=moment, median_depth=half, color=painted
             )
 
-        self.set_grad_out(self._march_again(body, replace(self.request.init_result(Float), median_depth=Float(0))))
+        self.set_grad_out(self._march_again(visit, replace(self.request.init_result(Float), median_depth=Float(0))))
 
-    def _march_again(self, body: Callable[[Any, Any], tuple[Any, Any]], extra: Any) -> Any:
-        """Repeat the primal's steps and thread ``extra`` through ``body(state, extra)``."""
-        f, t0 = self.request, self.inputs[3]
+    def _march_again(self, visit: Callable[..., tuple[Any, Any]], extra: Any) -> Any:
+        """Repeat the primal's steps and thread ``extra`` through ``visit(state, place, extra)``."""
+        f, (t0, t1) = self.request, self.inputs[3:]
         Float = type(t0)
         fraction, color = Float(1 if f.offset is None else f.offset), None if f.color is None else f.color.zero()
-        start = _Replay(**zero_sums(Float), active=f.active, color=color, t=t0, fraction=fraction)
+        start = _StepReplay(**zero_sums(Float), active=f.active, color=color, t=t0, fraction=fraction)
         with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, True):
-            _, extra = dr.while_loop((start, extra), lambda state, _: state.active, body, label="march adjoint")
-        return extra
+            return march_steps(LocalRay(*self.inputs), t1, f, start, visit, extra, "march adjoint")[1]
 
-    def _replay(self, leaves: list[Any], state: Any) -> tuple[ReplayStep, Any]:
-        """The next step, attached to ``leaves`` and the medium, and the state after it."""
+    def _replay(self, leaves: list[Any], state: Any, place: Step) -> tuple[ReplayStep, Any]:
+        """The step at ``place``, attached to ``leaves`` and the medium, and the state after it."""
         f, (primal_t0, primal_t1) = self.request, self.inputs[3:]
-        quadrature = RULES.find(f.settings.quadrature)
-        cells = cells_for_rule(quadrature, f.medium)
-        ray = LocalRay(*self.inputs)
-        active, t, delta, t_next = next_step(
-            f.medium, ray, state.t, primal_t1, state.fraction, f.settings, state.active, cells, f.fine_from
-        )
         o, d, w, t0, t1 = leaves
-        begin = t0 + (t - primal_t0)
-        length = dr.select(t_next >= primal_t1, t1 - begin, delta)
-        attached = LocalRay(o, d, w, t0, t1)
-        step = quadrature.step(f.medium, attached, begin, length, t_next, None, active, f.color is not None)
-        replayed, after = self._absorb(
+        begin = t0 + (place.t - primal_t0)
+        length = dr.select(place.t_next >= primal_t1, t1 - begin, place.delta)
+        step = place.quadrature.step(
+            f.medium, LocalRay(o, d, w, t0, t1), begin, length, place.t_next, None, state.active, f.color is not None
+        )
+        return self._absorb(
             state,
-            active,
             step.dtau,
             absorbed_fraction(dr.detach(step.dtau)),
-            dr.fma(length, step.mean_fraction, t - primal_t0),
+            dr.fma(length, step.mean_fraction, place.t - primal_t0),
             step.shade,
             lambda missing: begin + step.find_crossing(missing),
         )
-        return replayed, replace(after, active=after.active & (t_next < primal_t1), t=t_next, fraction=type(t0)(1))
 
     def _absorb(
         self,
         state: Any,
-        active: Bool,
         dtau: Float,
         absorbed: Float,
         mean: Float,
@@ -229,6 +223,7 @@ class MarchOp(dr.CustomOp):
             The colour of the step on a mask of lanes, and the distance at which a remaining optical depth is reached.
         """
         goal, end = optical_depth_limits(type(state.tau), self.request.settings, self.request.until)
+        active = state.active
         after, weight, crosses = state.absorb(active, dr.detach(dtau), absorbed, dr.detach(mean), goal)
         painted = None
         if self.request.color is not None:
@@ -256,7 +251,7 @@ class HitMarchOp(MarchOp):
 
     _primal = staticmethod(march_hits)
 
-    def _march_again(self, body: Callable[[Any, Any], tuple[Any, Any]], extra: Any) -> Any:
+    def _march_again(self, visit: Callable[..., tuple[Any, Any]], extra: Any) -> Any:
         f, (t0, t1) = self.request, self.inputs[3:]
         hits, ray = cast("Hits", f.medium.hits), LocalRay(*(dr.detach(x) for x in self.inputs))
         Float = type(t0)
@@ -265,7 +260,7 @@ class HitMarchOp(MarchOp):
 
         def take(state, t, index, extra):
             """Process the first hit of the group and shift the others."""
-            state, extra = body(replace(state, index=index[0]), extra)
+            state, extra = visit(state, index[0], extra)
             t, index = t[1:] + [Float(dr.inf)], index[1:] + [UInt32(0)]
             return replace(state, active=state.active & (t[0] < dr.inf)), t, index, extra
 
@@ -279,23 +274,22 @@ class HitMarchOp(MarchOp):
             return active & (farthest.t < dr.inf) & (state.tau < end), farthest, state, extra
 
         color = None if f.color is None else f.color.zero()
-        state = _Replay(**zero_sums(Float), active=f.active, color=color, index=UInt32(0))
+        state = _Replay(**zero_sums(Float), active=f.active, color=color)
         first = position_before(t0)
         with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, True):
             out = dr.while_loop((f.active, first, state, extra), lambda active, *_: active, group, label="hits adjoint")
         return out[3]
 
-    def _replay(self, leaves: list[Any], state: Any) -> tuple[ReplayStep, Any]:
-        medium, active, index = self.request.medium, state.active, state.index
+    def _replay(self, leaves: list[Any], state: Any, place: UInt32) -> tuple[ReplayStep, Any]:
+        medium, active = self.request.medium, state.active
         o, d, w, t0, t1 = leaves
-        t, absorbed = cast("Hits", medium.hits).reevaluate(LocalRay(o, d, w, t0, t1), index, active)
+        t, absorbed = cast("Hits", medium.hits).reevaluate(LocalRay(o, d, w, t0, t1), place, active)
         return self._absorb(
             state,
-            active,
             dr.select(active, -log1p(-absorbed), 0),
             dr.select(active, dr.detach(absorbed), 0),
             t - t0,
-            lambda painter, lit: painter.shade(medium, [index], o + d * t, w, lit),
+            lambda painter, lit: painter.shade(medium, [cast("Float", place)], o + d * t, w, lit),
             lambda missing: t,
         )
 

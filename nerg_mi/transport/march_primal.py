@@ -4,8 +4,9 @@ queries."""
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import drjit as dr
 
@@ -13,7 +14,7 @@ from nerg_mi.maths.arrays import kahan_add, log1p, quotient
 from nerg_mi.maths.types import Bool, Color, Float, UInt32
 
 from .medium import Hits, LastHit, LocalRay, Medium, Occupancy, SampleShader, VoxelCells
-from .quadrature import RULES, absorbed_fraction, cells_for_rule, shade_point
+from .quadrature import RULES, QuadratureRule, absorbed_fraction, cells_for_rule, shade_point
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -386,14 +387,73 @@ class MarchRequest:
         )
 
 
-@dataclass
-class _StepState:
-    """Loop state of a march in steps."""
+@dataclass(kw_only=True)
+class StepState:
+    """Loop state of a march in steps, to which marches add what they sum up."""
 
     active: Bool
+    # Start of the next step.
     t: Float
-    # Length of the next step as a fraction of a full one; None: always 1.
+    # Its length as a fraction of a full one; None: always 1. A state variable that never changes would be traced twice.
     fraction: Float | None
+
+
+@dataclass(frozen=True)
+class Step:
+    """Start, length and end of a step, with the rule and the voxels that it uses."""
+
+    t: Float
+    delta: Float
+    t_next: Float
+    quadrature: QuadratureRule
+
+
+_StateT = TypeVar("_StateT", bound=StepState)
+
+
+def march_steps(
+    ray: LocalRay,
+    t1: Float,
+    request: MarchRequest,
+    start: _StateT,
+    visit: Callable[..., tuple[_StateT, Any]],
+    extra: Any = None,
+    label: str = "march",
+) -> tuple[_StateT, Any]:
+    """Loop over the steps of ``ray`` up to ``t1``, of the march and of its derivatives.
+
+    Parameters
+    ----------
+    start : StepState
+        State before the first step.
+    visit : callable
+        Processes a step: ``visit(state, step, extra)`` returns the state, on whose ``active`` lanes the march goes on,
+        and ``extra``.
+    extra : Any
+        Further loop variables.
+    """
+    # Functional loops rather than @dr.syntax: variables of the closure (fields, settings) stay out of the loop state,
+    # which would otherwise carry the weight arrays of a field.
+    medium, settings = request.medium, request.settings
+    quadrature = RULES.find(settings.quadrature)
+    cells, one = cells_for_rule(quadrature, medium), type(t1)(1)
+
+    def body(state: _StateT, extra: Any) -> tuple[_StateT, Any]:
+        fraction = one if state.fraction is None else state.fraction
+        active, t, delta, t_next = next_step(
+            medium, ray, state.t, t1, fraction, settings, state.active, cells, request.fine_from
+        )
+        state, extra = visit(replace(state, active=active), Step(t, delta, t_next, quadrature), extra)
+        fraction = None if state.fraction is None else one
+        return replace(state, active=state.active & (t_next < t1), t=t_next, fraction=fraction), extra
+
+    return dr.while_loop((start, extra), lambda state, _: state.active, body, label=label)
+
+
+@dataclass(kw_only=True)
+class _PrimalState(StepState):
+    """Loop state of `march_primal`."""
+
     # What the next step reuses of the previous one.
     carry: Any
     # Weight of the samples that have not been shaded yet; None without a shader.
@@ -458,61 +518,53 @@ class _DeferredSamples:
 def march_primal(ray: LocalRay, t0: Float, t1: Float, request: MarchRequest) -> MarchResult:
     """March ``ray`` in steps from ``t0`` to ``t1``."""
     Float, medium, settings = type(t0), request.medium, request.settings
-    color, fine_from, occlusion = request.color, request.fine_from, request.occlusion
+    color, occlusion = request.color, request.occlusion
     goal, end = optical_depth_limits(Float, settings, request.until)
 
-    # Functional loops rather than @dr.syntax: variables of the closure (fields, settings) stay out of the loop state,
-    # which would otherwise carry the weight arrays of a field.
-    quadrature = RULES.find(settings.quadrature)
-    cells = cells_for_rule(quadrature, medium)
     num_deferred = 0 if color is None else count_deferred(medium, settings.color_cutoff)
 
-    def body(state: _StepState) -> tuple[_StepState]:
-        fraction = Float(1) if state.fraction is None else state.fraction
-        active, t, delta, t_next = next_step(
-            medium, ray, state.t, t1, fraction, settings, state.active, cells, fine_from
-        )
+    def visit(state: _PrimalState, step: Step, _: None) -> tuple[_PrimalState, None]:
+        active, t, delta, t_next = state.active, step.t, step.delta, step.t_next
         result, tau, pending, deferred = replace(state.result), state.result.tau, state.pending, state.deferred
         if occlusion is not None:
             active = result.record_decided(occlusion.is_clear(t, tau), active)
-        step = quadrature.step(medium, ray, t, delta, t_next, state.carry, active, color is not None)
-        distance = dr.fma(delta, step.mean_fraction, t - t0)
-        result, weight, crosses = result.absorb(active, step.dtau, absorbed_fraction(step.dtau), distance, goal)
-        slope = delta / dr.select(crosses, step.dtau, 1)
-        result.record_crossing(crosses, t + step.find_crossing(goal - tau), slope, t, tau)
+        matter = step.quadrature.step(medium, ray, t, delta, t_next, state.carry, active, color is not None)
+        distance = dr.fma(delta, matter.mean_fraction, t - t0)
+        result, weight, crosses = result.absorb(active, matter.dtau, absorbed_fraction(matter.dtau), distance, goal)
+        slope = delta / dr.select(crosses, matter.dtau, 1)
+        result.record_crossing(crosses, t + matter.find_crossing(goal - tau), slope, t, tau)
         if color is not None:
             shader = color
             pending = pending + weight
             shaded = active & (pending > settings.color_cutoff)
             if deferred is None:
                 contribution = dr.if_stmt(
-                    (shaded,), shaded, lambda lit: step.shade(shader, lit), lambda lit: shader.zero(), label="colour"
+                    (shaded,), shaded, lambda lit: matter.shade(shader, lit), lambda lit: shader.zero(), label="colour"
                 )
                 result.color = result.color + pending * contribution
             else:
-                deferred = deferred.add(shaded, step.color_distance, pending)
+                deferred = deferred.add(shaded, matter.color_distance, pending)
             pending = dr.select(shaded, 0, pending)
             if result.color_evals is not None:
                 result.color_evals = result.color_evals + dr.select(shaded, 1, 0)
         if result.density_evals is not None:
-            result.density_evals = result.density_evals + step.evals
+            result.density_evals = result.density_evals + matter.evals
         if occlusion is not None:
             active = result.record_decided(occlusion.is_hidden(t_next, result.tau), active)
-        active = active & (t_next < t1) & (result.tau < end)
-        fraction = None if state.fraction is None else Float(1)
-        return (_StepState(active, t_next, fraction, step.carry, pending, result, deferred),)
+        active = active & (result.tau < end)
+        carry = matter.carry
+        return replace(state, active=active, carry=carry, pending=pending, result=result, deferred=deferred), None
 
-    start = _StepState(
-        request.active,
-        t0,
-        # A state variable that never changes would be traced twice.
-        None if request.offset is None else Float(request.offset),
-        quadrature.init_carry(Float),
-        None if color is None else Float(0),
-        request.init_result(Float),
-        _DeferredSamples.zero(Float, num_deferred) if num_deferred else None,
+    start = _PrimalState(
+        active=request.active,
+        t=t0,
+        fraction=None if request.offset is None else Float(request.offset),
+        carry=RULES.find(settings.quadrature).init_carry(Float),
+        pending=None if color is None else Float(0),
+        result=request.init_result(Float),
+        deferred=_DeferredSamples.zero(Float, num_deferred) if num_deferred else None,
     )
-    (state,) = dr.while_loop((start,), lambda state: state.active, body, label="march")
+    state, _ = march_steps(ray, t1, request, start, visit)
     result = state.result
     if color is not None:
         if state.deferred is not None:
