@@ -1,6 +1,7 @@
 """Claims of the paper about its variants, tested over participants, positions and seeds.
 
     python benchmarks/paper_claims.py [--only supermarket,store] [--folds 4] [--steps 800] [--recipes default,paper]
+        [--variant emit_capture] [--result paper]
 
 The benchmark runs one ablation (`ablation.py`) per fold, in which other participants (half), other positions (60 in
 three zones) and another seed are held out. It compares emit, capture and their product, the losses, the semantic
@@ -9,9 +10,9 @@ features, and the initialisations of the paper.
 The table of a scene has one row per recipe and variant. Its columns are means over folds: the paper's loss, KLD + (1 -
 CC) + MAE, on training positions; its increase on held-out positions; KLD and CC on held-out positions, and their
 difference from the product of the same recipe, computed fold by fold, with 95 % intervals of Student's t. The last
-table has the CC of all scenes, one row per scene and recipe: the CC of the product, the differences of the variants
-from it, and the median training time of the product in seconds. Results are stored in the output folder, and a second
-run does not train them again.
+table has the CC of all scenes, one row per scene and recipe: the CC of the product, also by fold, the differences of
+the variants from it, and the median number of steps and training time of the product. Trainings are stored in the
+output folder, and a second run does not repeat them.
 """
 
 from __future__ import annotations
@@ -44,6 +45,7 @@ def main(argv=None) -> None:
     parser.add_argument(
         "--variant", action="append", default=[], help="Name of a variant to train; can be repeated. Default: all."
     )
+    parser.set_defaults(result="paper")
     args = parse(parser, argv)
     each: list[dict] = []
     for name, make in parse_environments(args).items():
@@ -60,9 +62,9 @@ def main(argv=None) -> None:
     seeds = ", ".join(map(str, range(args.folds)))
     heads = ("scene", "recipe", "variant", "training loss", "held-out minus training loss")
     heads += ("KLD", "KLD minus product", "CC", "CC minus product")
-    save_result("paper-variants", heads, summarise(each), seeds)
-    heads = ("scene", "recipe", "product", *(f"{v} minus product" for v in ORDER), "training time, s")
-    save_result("paper-claims", heads, order(each), seeds)
+    save_result(f"{args.result}-variants", heads, summarise(each), seeds)
+    heads = ("scene", "recipe", "product", "product by fold", *(f"{v} minus product" for v in ORDER))
+    save_result(f"{args.result}-claims", (*heads, "steps", "training time, s"), order(each), seeds)
 
 
 def summarise(rows: list[dict]) -> list[list[str]]:
@@ -81,15 +83,17 @@ def summarise(rows: list[dict]) -> list[list[str]]:
 
 
 def order(rows: list[dict]) -> list[list[str]]:
-    """CC of the product in each scene, the differences of the variants of `ORDER` from it, and training seconds."""
+    """CC of the product in each scene and fold, the differences of the variants of `ORDER` from it, and its steps and
+    seconds."""
     out = []
     for place, recipe in dict.fromkeys((r["place"], r["recipe"]) for r in rows):
         separate = [r for r in rows if r["place"] == place]
         full = [r for r in separate if (r["recipe"], r["variant"]) == (recipe, WHOLE)]
         cc = f"{np.mean([r['test_CC'] for r in full]):.3f}" if full else ""
-        seconds = f"{np.median([r['train_seconds'] for r in full]):.0f}" if full else ""
+        by_fold = ", ".join(f"{r['test_CC']:.3f}" for r in full)
+        cost = [f"{np.median([r[key] for r in full]):.0f}" if full else "" for key in ("steps", "train_seconds")]
         above = (print_row(less(separate, recipe, variant, "test_CC")) for variant in ORDER)
-        out.append([place, recipe, cc, *above, seconds])
+        out.append([place, recipe, cc, by_fold, *above, *cost])
     return out
 
 

@@ -150,6 +150,20 @@ def test_the_best_baseline_of_a_score_has_the_best_mean(benchmark):
     assert latest("room")["columns"] == results.read("gaze-recorded")["columns"]
 
 
+def test_variants_of_the_paper_are_compared_fold_by_fold(benchmark):
+    claims = benchmark("paper_claims")
+    cc = {"emit_capture": (0.5, 0.7), "emit": (0.6, 0.6)}
+    rows = [
+        {"place": "room", "recipe": "paper", "variant": variant, "fold": fold, "test_CC": pair[fold]}
+        | {"steps": 640 * (fold + 1), "train_seconds": 10.0}
+        for variant, pair in cc.items()
+        for fold in (0, 1)
+    ]
+    (row,) = claims.order(rows)
+    assert row[:4] == ["room", "paper", "0.600", "0.500, 0.700"] and row[-2:] == ["960", "10"]
+    assert row[4].startswith("+0.000 ± ") and row[5:7] == ["", ""]
+
+
 SCRIPTS = sorted(p.stem for p in (ROOT / "benchmarks").glob("*.py") if "__main__" in p.read_text(encoding="utf-8"))
 ON_PAGES = {"independent_score"}
 """Benchmarks without a result, which a page names."""
