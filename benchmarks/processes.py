@@ -1,7 +1,8 @@
-"""Measurements in separate processes: the peak memory of a frame, and start-up times.
+"""Measurements in separate processes: the peak memory of a frame, start-up times, and the commands of a study.
 
     python benchmarks/processes.py memory [--sizes 640x360,1280x720,1920x1080]
     python benchmarks/processes.py start [--runs 5]
+    python benchmarks/processes.py commands
 
 ``memory`` measures a frame of the demo store with colour, depth and the gaze of an observer who is not at the camera,
 at one sample per pixel. The image is rendered in one piece by ``mi.render``, and in strips by `nerg render`. Resident
@@ -13,6 +14,9 @@ that Dr.Jit held in arrays. Kernels come from the cache: a first process, which 
 image and the demo are finished. The commands alternate. The table has medians and quartiles of wall-clock seconds, and
 medians of CPU seconds. A first round, which is not measured, loads the files into the cache of the system. "Cold" runs
 start without compiled kernels, "warm" runs with those of previous runs.
+
+``commands`` runs those of the quick start once, in their order, on 150,021 samples of 100 simulated participants of the
+demo store. The first one starts without compiled kernels. The table has wall-clock and CPU seconds.
 """
 
 from __future__ import annotations
@@ -35,6 +39,7 @@ WAYS = ("mi.render", "nerg render")
 HEADS = {
     "memory": ("image size", *(f"`{mode}`: peak memory (arrays), MB" for mode in WAYS)),
     "start": ("command", "time, s", "quartiles, s", "CPU time, s"),
+    "commands": ("command", "time, s", "CPU time, s"),
 }
 """Titles of columns by benchmark."""
 COMMAND = [str(Path(sys.executable).with_name("nerg"))]
@@ -136,6 +141,40 @@ def start(runs: int) -> list[list[str]]:
     return rows
 
 
+def quick_start(tracking: Path, folder: Path) -> list[list[str]]:
+    """Arguments of the commands of the quick start, each of which reads files of those before it in ``folder``."""
+    from nerg_mi.scenes.store import SCENE_FILE
+
+    field, areas = (str(SCENE_FILE.with_name(name)) for name in ("store.safetensors", "regions.json"))
+    names = ("rays.npz", "gaze.safetensors", "gaze.eval", "scene.xml", "report.html", "numbers")
+    rays, gaze, scores, scene, report, numbers = (str(folder / name) for name in names)
+    return [
+        ["rays", "import", str(tracking), "--preset", "skeleton", "--tick", "0.001", "-o", rays],
+        ["train", "gaze", rays, "--environment", field, "--test-zones", "3", "--test-participants", "0.5", "-o", gaze],
+        ["eval", "gaze", gaze, rays, "--environment", field],
+        ["scene", field, gaze, rays, "-o", scene],
+        ["report", field, gaze, rays, scores, "--aois", areas, "-o", report],
+        ["stats", rays, scene, "--aois", areas, "-o", numbers],
+    ]
+
+
+def commands() -> list[list[str]]:
+    """A row for each command of `quick_start`."""
+    from nerg_mi.scenes.store import make
+
+    tracking, rows = Path(make.__file__).parent / "build" / "shoppers.csv", []
+    if not tracking.is_file():
+        make.main(["--stage", "shoppers"])
+    with tempfile.TemporaryDirectory() as name:
+        kernels = Path(name) / "kernels"
+        kernels.mkdir()
+        for words in quick_start(tracking, Path(name)):
+            wall, cpu = seconds_of([*COMMAND, *words], kernels)
+            title = " ".join(words[: 2 if words[0] in ("rays", "train", "eval") else 1])
+            rows.append([f"`nerg {title}`", f"{wall:.3g}", f"{cpu:.3g}"])
+    return rows
+
+
 def main(argv=None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=HEADS, help="Measurement; see above.")
@@ -157,8 +196,8 @@ def main(argv=None) -> None:
     if args.one:
         print(json.dumps(peak(args.one, *sizes[0])))
         return
-    rows = memory(sizes) if args.what == "memory" else start(args.runs)
-    save_result(args.what, HEADS[args.what], rows)
+    measure = {"memory": lambda: memory(sizes), "start": lambda: start(args.runs), "commands": commands}
+    save_result(args.what, HEADS[args.what], measure[args.what]())
 
 
 if __name__ == "__main__":

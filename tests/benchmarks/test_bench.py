@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import ROOT
+from tests.test_docs import check_command, commands
 from tools import results
 
 
@@ -58,6 +59,15 @@ def test06_peak_memory_of_this_process(benchmark):
     assert memory.status("VmHWM") > 0.9 * memory.status("VmRSS") > 9
     with pytest.raises(RuntimeError, match="VmNothing"):
         memory.status("VmNothing")
+
+
+def test_timed_commands_are_those_of_the_quick_start(benchmark, tmp_path):
+    page = (ROOT / "docs" / "tutorials" / "quickstart.md").read_text(encoding="utf-8")
+    printed = [words[1:] for words in commands(page) if words[0] == "nerg"]
+    for words in benchmark("processes").quick_start(tmp_path / "shoppers.csv", tmp_path):
+        check_command("nerg", *words)
+        options = [word for word in words if word.startswith("-")]
+        assert any(line[0] == words[0] and [w for w in line if w.startswith("-")] == options for line in printed), words
 
 
 def test07_steps_alternate(benchmark, monkeypatch, tmp_path):
