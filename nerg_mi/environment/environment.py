@@ -198,6 +198,11 @@ class Environment:
         return self.save(stem if self.kind == "hits" else stem.with_name(f"{stem.name}.environment"))
 
     @property
+    def input(self) -> Any:
+        """Its file, or the object that it was opened from if it has no file."""
+        return self.source if self.path is None else self.path
+
+    @property
     def has_surfaces(self) -> bool:
         """Whether there is something to see: without geometry, participants have directions only."""
         return self.kind != "none"

@@ -478,6 +478,7 @@ def make_scene(
     integrator: dict[str, Any] = {"type": "nerg", **settings}
     transform = None if to_world is None else _as_transform(to_world)
     children: dict[str, Any] = {}
+    environment = _unwrap_environment(environment)
     content, kind, path = find_content(environment), "", Path()
     if isinstance(environment, (str, os.PathLike)):
         path, kind = Path(environment), _find_kind(environment, "environment")
@@ -494,6 +495,8 @@ def make_scene(
         integrator |= {k: v for k, v in children.pop(name).items() if k not in left_out} | settings
     elif kind == "hits":
         integrator = _make_hit_volumes(path, transform) | integrator
+    elif isinstance(environment, GridVolume):
+        integrator = _make_grid_volumes(environment, transform) | integrator
     elif isinstance(environment, DensityGrid):
         integrator = dict(environment.volumes(transform)) | integrator
     elif kind in ("field", "splats") or isinstance(environment, (TrainedField, Splats)):
@@ -595,6 +598,18 @@ def find_content(environment: AnyEnvironment) -> dict[str, Any] | None:
     return dict(environment) if is_scene and has_nerg(environment) else None
 
 
+def _unwrap_environment(environment: AnyEnvironment) -> AnyEnvironment:
+    """Return the file or the object of an `Environment`, and others as they are. Raises `NergError` for one without
+    surfaces."""
+    import nerg_mi  # the class above this module
+
+    if not isinstance(environment, nerg_mi.Environment):
+        return environment
+    if not environment.has_surfaces:
+        raise NergError("the environment has no surfaces to show; leave it out, or pass another one")
+    return environment.input
+
+
 def _take_shapes(environment: AnyEnvironment, kind: str) -> dict[str, Any]:
     """The shapes and lights of an environment by name; ``kind`` is that of a file. Raises `NergError` for a loaded
     scene with a field."""
@@ -627,11 +642,17 @@ def _find_kind(value: str | os.PathLike, name: str) -> str:
 def _make_hit_volumes(path: Path, to_world: Any) -> dict[str, Any]:
     """Make the density and the colour of a volume of hit points, as properties of the integrator."""
     density, lower, upper = read_hit_volume(path)
-    color, upper = shade_hits(density, lower, upper)
     world = {} if to_world is None else {"to_world": to_world}
+    volume = {"type": "gridvolume", "filename": os.path.abspath(path), "use_grid_bbox": True, **world}
+    return _make_grid_volumes(GridVolume(density, lower, upper), to_world) | {"density": volume}
+
+
+def _make_grid_volumes(density: GridVolume, to_world: Any) -> dict[str, Any]:
+    """As `_make_hit_volumes`, of a volume in memory."""
+    color, upper = shade_hits(density.values, density.lower, density.upper)
     return {
-        "density": {"type": "gridvolume", "filename": os.path.abspath(path), "use_grid_bbox": True, **world},
-        "color": GridVolume(color, lower, upper, to_world),
+        "density": GridVolume(density.values, density.lower, density.upper, to_world),
+        "color": GridVolume(color, density.lower, upper, to_world),
         "background": {"type": "rgb", "value": NO_DATA_GREY},
     }
 

@@ -211,6 +211,8 @@ class _Builder:
             self._add_meshes(ExchangeMesh(name, mesh.vertices, mesh.faces, colors, item.density, item.content.unit))
             return
         item = item.splats if isinstance(item, SplatBake) else item
+        if isinstance(item, Environment) and item.has_surfaces:
+            item = item.input
         role = find_role(item)
         if role == "rays":
             self._add_rays(open_rays(item), name)

@@ -23,6 +23,7 @@ from nerg_mi.environment.hits import (
 )
 from nerg_mi.environment.kinds import KINDS
 from nerg_mi.environment.planned import PlannedFiles
+from nerg_mi.environment.queries import trace
 from nerg_mi.environment.radiance import RadianceField
 from nerg_mi.environment.scene import make_scene
 from nerg_mi.environment.scene_file import write_scene
@@ -420,6 +421,25 @@ def test_objects_are_opened_like_their_files(rgb, tmp_path):
             np.testing.assert_allclose(ours, theirs, atol=2e-5 if file != "grid.vol" else 0.02, err_msg=file)
         np.testing.assert_allclose(opened.box.lower, loaded.box.lower, atol=1e-6)
         assert Environment.open(opened) is opened
+        shown = [trace(make_scene(x), origins, directions, "depth").depth for x in (opened, loaded, value)]
+        assert np.isfinite(shown[0]).any() and np.array_equal(shown[0], shown[2]), file
+        np.testing.assert_allclose(shown[0], shown[1], atol=2e-5 if file != "grid.vol" else 0.02, err_msg=file)
+
+
+def test_hits_in_memory_are_shown_as_those_of_a_file(rgb, tmp_path):
+    rays = looking_at(np.array([1.5, 0, 1]), 200)
+    hits, origin = make_hit_geometry(rays), np.array([0.0, 0, 1.5])
+    directions = rays.hit[:20] - origin
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    first, second = (
+        trace(make_scene(environment), origin, directions, ["depth", "opacity", "color"])
+        for environment in (hits, hits.save(tmp_path / "hits"))
+    )
+    assert first.opacity.mean() > 0.5
+    for name in ("depth", "opacity", "color"):
+        np.testing.assert_allclose(first[name], second[name], atol=1e-5, err_msg=name)
+    with pytest.raises(NergError):
+        make_scene(no_geometry(np.zeros((1, 3))))
 
 
 @pytest.mark.parametrize("value", [None, 3, Rays, {"type": "scene"}])
