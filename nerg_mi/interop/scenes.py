@@ -197,6 +197,11 @@ def _describe(scene: ExchangeScene) -> str:
     return ", ".join(f"{count:,} {one if count == 1 else several}" for (one, several), count in counts.items() if count)
 
 
+def _unwrap(item: Any) -> Any:
+    """Return what an environment with surfaces was opened from; other items as they are."""
+    return item.input if isinstance(item, Environment) and item.has_surfaces else item
+
+
 class _Builder:
     """Collects the contents of a scene in ``scene``."""
 
@@ -211,8 +216,7 @@ class _Builder:
             self._add_meshes(ExchangeMesh(name, mesh.vertices, mesh.faces, colors, item.density, item.content.unit))
             return
         item = item.splats if isinstance(item, SplatBake) else item
-        if isinstance(item, Environment) and item.has_surfaces:
-            item = item.input
+        item = _unwrap(item)
         role = find_role(item)
         if role == "rays":
             self._add_rays(open_rays(item), name)
