@@ -286,12 +286,16 @@ become those of Python where there is no bar. A `Reporter` receives everything."
 @contextmanager
 def open_reporter(progress: Progress) -> Iterator[Reporter]:
     """Yield the reporter of a call. Raises `NergError` for anything but a `Progress`."""
-    if isinstance(progress, Reporter):
-        # Reporters of this package spell what they show, that of a command as options.
-        yield progress if isinstance(progress, (SilentReporter, TerminalReporter)) else SpellingReporter(progress)
+    # Reporters of this package spell what they show, that of a command as options.
+    if isinstance(progress, (SilentReporter, TerminalReporter)):
+        yield progress
         return
+    # Protocols last: Python takes longer to compare with one than an image takes to render.
     if not (progress is None or isinstance(progress, bool)):
-        raise NergError(f"{parameter('progress')} must be True, False or a Reporter, got {type(progress).__name__}")
+        if not isinstance(progress, Reporter):
+            raise NergError(f"{parameter('progress')} must be True, False or a Reporter, got {type(progress).__name__}")
+        yield SpellingReporter(progress)
+        return
     shows = is_notebook() if progress is None else progress
     with WarningReporter() if not shows else NotebookReporter() if is_notebook() else TerminalReporter() as reporter:
         yield reporter

@@ -249,6 +249,7 @@ from nerg_mi.transport.medium import Medium
 from nerg_mi.transport.observer import VISIBILITIES, ObserverCache, ObserverSettings, check_center, sensor_center
 from nerg_mi.transport.observer_gaze import GazeFieldInstance
 from nerg_mi.transport.quadrature import RULES, cells_for_rule
+from nerg_mi.transport.recording import Recorder
 from nerg_mi.transport.volume_medium import FrozenBound, VolumeMedium
 
 from .nerg_pixel import RenderContext
@@ -476,6 +477,9 @@ __doc__ = fill_manual(__doc__ or "").replace("{aovs}", nerg_aovs.format_manual()
 class NergIntegrator(mi.SamplingIntegrator):
     __doc__ = SUMMARY + (__doc__ or "")
 
+    # What images do not depend on, or what a recording takes from elsewhere.
+    UNRECORDED = ("_children", "_frozen_bound", "_sensors", "cache", "observer", "recorder", "variant")
+
     def __init__(self, props):
         super().__init__(props)
         if mi.is_spectral or mi.is_polarized:
@@ -502,7 +506,7 @@ class NergIntegrator(mi.SamplingIntegrator):
         self.aovs = nerg_aovs.parse_aovs(read_string(props, "aovs", "depth,opacity"), self)
         self.required_data = nerg_aovs.collect_required_data(self.aovs)
         self.views = nerg_aovs.collect_observer_views(self.aovs, self)
-        self.cache = ObserverCache()
+        self.cache, self.recorder = ObserverCache(), Recorder()
         self.variant = mi.variant()
         self._sensors = None  # sensor of the current rendering; None if another integrator calls this one
 

@@ -4,9 +4,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, cast
+from typing import Any, ClassVar, cast
 
 import drjit as dr
 import mitsuba as mi
@@ -16,14 +16,17 @@ from nerg_mi.maths.color import composite_to_linear
 from nerg_mi.maths.types import Bool, Color, Float, Point3f, Ray3f, Vector3f
 from nerg_mi.transport import aovs as nerg_aovs
 from nerg_mi.transport import observer
-from nerg_mi.transport.field_medium import FeatureShader, make_color_shader
+from nerg_mi.transport.depth import DEPTHS
+from nerg_mi.transport.field_medium import FeatureShader, FieldMedium, make_color_shader
 from nerg_mi.transport.geometry import SceneGeometry
 from nerg_mi.transport.jit import is_recording
 from nerg_mi.transport.march_primal import MarchResult
 from nerg_mi.transport.medium import SampleShader
-from nerg_mi.transport.observer import ObserverCache, ObserverView, evaluate_view
+from nerg_mi.transport.observer import CacheEntry, ObserverCache, ObserverView, observe_view, select_nearest
 from nerg_mi.transport.observer_gaze import GazeFieldInstance, ObservedGaze
-from nerg_mi.transport.occlusion import ObserverHit, trace_from_observer
+from nerg_mi.transport.occlusion import ObserverHit, ObserverMap, get_observer_map, trace_from_observer
+from nerg_mi.transport.quadrature import RULES
+from nerg_mi.transport.recording import NotRecordable
 from nerg_mi.transport.splat_medium import SplatMedium
 
 # Mitsuba, with its arrays typed as in `maths.types`.
@@ -50,6 +53,19 @@ class RenderContext:
     views: Mapping[str, ObserverView]
     # Whether colour is computed.
     radiance: bool
+
+    @property
+    def can_use_gaze_map(self) -> bool:
+        """Whether a map can replace the gaze field: it stores no factors, standard deviation or features."""
+        if self.nerg.gaze is None or "gaze" not in self.required_data or self.required_data & {"factors", "spread"}:
+            return False
+        return not self.nerg.gaze.field.config.features
+
+    @property
+    def needs_visibility(self) -> bool:
+        """Whether an AOV depends on what the observer sees, other than the position of the observer alone."""
+        views = self.views
+        return any(name not in views or views[name].is_occluded for name in self.observer_aovs)
 
     @property
     def shared_aovs(self) -> list[str]:
@@ -87,6 +103,33 @@ class RenderContext:
         offset = cast("Any", sampler).next_1d(active) if self.nerg.jitter else None
         return CameraView(self, scene, sensors, ray, active, offset, may_list)
 
+    def list_inputs(self, scene: mi.Scene) -> list[Any]:
+        """All objects that camera rays of ``scene`` read, for a recording. Raises `NotRecordable`."""
+        nerg = self.nerg
+        if len(scene.shapes()) > 0 or len(scene.emitters()) > 0:
+            raise NotRecordable("the shapes and lights of the scene")
+        if not (nerg.medium is None or isinstance(nerg.medium, FieldMedium)):
+            raise NotRecordable(f"a {type(nerg.medium).__name__}")
+        trained = [nerg.medium.field] if nerg.medium is not None else []
+        trained += [] if nerg.gaze is None else [nerg.gaze.field]
+        if any(net.has_constant_weights for field in trained for net in field.mlps):
+            raise NotRecordable("constant weights")
+        rules = [RULES.find(nerg.settings.quadrature), DEPTHS.find(nerg.observer_settings.depth)]
+        return [self, nerg.hide_emitters, rules, [nerg_aovs.AOVS[name].compute for name in self.aovs]]
+
+    def make_own_observer(self, sensors: Sequence[mi.Sensor]) -> ObserverContext:
+        """The observer of the integrator, or the centre of the only one of ``sensors``, evaluated."""
+        is_camera = self.nerg.observer is None
+        if is_camera:
+            for sensor in sensors:
+                observer.check_centers(sensor)
+            (center,) = observer.sensor_centers(sensors)
+        else:
+            center = observer.sensor_center(self.nerg.observer)
+        p_o = arrays.Point3f(center)
+        dr.make_opaque(p_o)
+        return ObserverContext(p_o, [p_o], self.nerg.cache, True if is_camera else None)
+
     def make_observer(self, position: Sequence[float], is_only: bool = False) -> ObserverContext:
         """The observer at ``position`` (3,). ``is_only``: the only one, whose data is kept in the integrator's
         cache."""
@@ -100,11 +143,18 @@ class RenderContext:
 class ObserverContext:
     """An observer, and the data that is cached for them during the lifetime of this object."""
 
+    # A recording takes what `prepare` computes.
+    UNRECORDED: ClassVar[tuple[str, ...]] = ("cache",)
+
     # Position per lane, and all distinct positions (one lane each).
     p_o: Point3f
     positions: list[Point3f]
     cache: ObserverCache
+    # Whether the observer is at the camera; None if that is not known.
+    is_at_camera: bool | None = None
     _gaze: ObservedGaze | None = None
+    _map: ObserverMap | None = None
+    _views: dict[str, list[CacheEntry]] = field(default_factory=dict)
 
     def gaze(self, context: RenderContext, geometry: SceneGeometry) -> ObservedGaze:
         """The gaze field for these positions, prepared once. ``context``: one with a gaze field."""
@@ -112,6 +162,32 @@ class ObserverContext:
             placed = cast("GazeFieldInstance", context.nerg.gaze)
             self._gaze = placed.for_observers(self.positions, geometry, context.nerg.observer_settings, self.cache)
         return self._gaze
+
+    def map(self, context: RenderContext, geometry: SceneGeometry) -> ObserverMap | None:
+        """The map around this observer, computed once; None unless visibility is decided by a map."""
+        settings = context.nerg.observer_settings
+        if self._map is None and settings.visibility == "map":
+            gaze = self.gaze(context, geometry) if context.can_use_gaze_map else None
+            self._map = get_observer_map(geometry, self.p_o, settings, gaze, self.cache)
+        return self._map
+
+    def view(self, name: str, view: ObserverView) -> list[CacheEntry]:
+        """The ``view`` called ``name`` for these positions, computed once."""
+        if name not in self._views:
+            self._views[name] = observe_view(view, self.positions, self.cache)
+        return self._views[name]
+
+    def prepare(self, context: RenderContext, scene: mi.Scene, sensors: Sequence[mi.Sensor], lanes: int) -> None:
+        """Compute all that an evaluation of ``lanes`` rays of ``sensors`` reads: a recording cannot compute it."""
+        geometry = SceneGeometry(context.nerg.medium, scene)
+        if self.is_at_camera is None:
+            self.is_at_camera = observer.have_same_center(sensors, self.p_o)
+        if "gaze" in context.required_data:
+            self.gaze(context, geometry).prepare(lanes)
+        if context.nerg.occlusion and not self.is_at_camera and context.needs_visibility:
+            self.map(context, geometry)
+        for name, view in context.views.items():
+            self.view(name, view)
 
 
 class CameraView:
@@ -298,16 +374,18 @@ class Pixel:
         context, camera = self.context, self.camera
         if context.nerg.observer is None:
             p_o = observer.center_of_ray(camera.sensors, camera.camera_ray)
-            return ObserverContext(p_o, observer.sensor_centers(camera.sensors), context.nerg.cache)
+            return ObserverContext(p_o, observer.sensor_centers(camera.sensors), context.nerg.cache, True)
         p_o = observer.sensor_center(context.nerg.observer)
         return ObserverContext(p_o, [p_o], context.nerg.cache)
 
     @cached_property
     def is_aligned(self) -> bool:
         """Whether the observer is at the camera and therefore sees the same surfaces."""
-        if self._is_aligned or (self._observer is None and self.context.nerg.observer is None):
+        if self._is_aligned:
             return True
-        return observer.have_same_center(self.camera.sensors, self.observer.p_o)
+        if self.observer.is_at_camera is None:
+            self.observer.is_at_camera = observer.have_same_center(self.camera.sensors, self.observer.p_o)
+        return self.observer.is_at_camera
 
     @cached_property
     def distance_and_direction(self) -> tuple[Float, Vector3f]:
@@ -335,8 +413,7 @@ class Pixel:
             context.nerg.falloff,
             context.nerg.observer_settings,
             count=camera.counts_evaluations,
-            gaze=self.gaze if self._can_use_gaze_map else None,
-            cache=self.observer.cache,
+            observer_map=self.observer.map(context, camera.geometry),
             needs_depth=bool(context.required_data & {"factors", "observer_depth"}),
             num_rays=camera.num_rays,
         )
@@ -350,14 +427,6 @@ class Pixel:
         gaze = self.observer.gaze(self.context, self.camera.geometry)
         gaze.prepare(dr.width(self.r_o))
         return gaze
-
-    @property
-    def _can_use_gaze_map(self) -> bool:
-        """Whether a map can replace the gaze field: it stores no factors, standard deviation or features."""
-        required_data = self.context.required_data
-        if self.context.nerg.gaze is None or "gaze" not in required_data or required_data & {"factors", "spread"}:
-            return False
-        return not self.context.nerg.gaze.field.config.features
 
     @cached_property
     def surface_gaze(self) -> SurfaceGaze:
@@ -412,7 +481,7 @@ class Pixel:
     def evaluate_observer_view(self, name: str) -> Float:
         """The observer view ``name`` on the surface, 0 elsewhere."""
         view, observer = self.context.views[name], self.observer
-        value = evaluate_view(view, observer.positions, observer.p_o, self.r_o, observer.cache)
+        value = select_nearest(observer.view(name, view), observer.p_o, lambda value: value.evaluate(self.r_o))
         return dr.select(
             self.camera.has_surface, value * self.observer_hit.visibility if view.is_occluded else value, 0
         )

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, cast, runtime_checkable
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from nerg_mi.fields.mlp import set_constant_weights
 from nerg_mi.fields.radiance import RadianceNetwork
 from nerg_mi.maths.types import variant_types
 from nerg_mi.transport.field_medium import FieldMedium
+from nerg_mi.transport.recording import Recorder
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -37,13 +38,29 @@ class LayerSource(Protocol):
     num_channels: int
     """Number of AOV channels of a single image with all AOVs; samples are accumulated as in that image."""
 
+    recorder: Recorder | None
+    """The recordings of the scene, if these are `RecordableLayers`; None otherwise."""
+
     def sample(self, scene, sampler, ray, medium, active) -> Iterable[tuple]:
         """Yield ``(radiance, valid, aovs)`` of each image, as the ``sample`` method of an integrator returns them."""
         ...
 
 
+class RecordableLayers(LayerSource, Protocol):
+    """A `LayerSource` whose images can be recorded and replayed."""
+
+    def list_inputs(self, scene, num_rays: int) -> list[Any]:
+        """Return all objects that ``sample`` reads for ``num_rays`` rays, besides the sensor.
+
+        What cannot be computed in a recording is computed now.
+        """
+        ...
+
+
 class IntegratorLayer:
     """The image of an integrator, as the only layer."""
+
+    recorder: Recorder | None = None
 
     def __init__(self, integrator):
         self.channel_names, self._integrator = [integrator.aov_names()], integrator
@@ -145,16 +162,25 @@ class SamplePace:
 
 def get_base_seed(sampler) -> int | None:
     """Return the ``seed`` of an ``independent`` sampler; None for other samplers and for unknown seeding schemes."""
-    import drjit as dr
+    import mitsuba as mi
 
     match = re.search(r"base_seed = (\d+)", str(sampler))
     if sampler.class_name() != "IndependentSampler" or not match:
         return None
-    base, reference, count = int(match[1]), sampler.clone(), 64
+    return int(match[1]) if _can_reproduce(int(match[1]), mi.variant()) else None
+
+
+@functools.cache
+def _can_reproduce(base: int, variant: str) -> bool:
+    """Whether `make_strip_sampler` reproduces Mitsuba's sampler of this seed. If a release of Mitsuba seeds
+    differently, images are rendered undivided and stay correct."""
+    import drjit as dr
+    import mitsuba as mi
+
+    reference, count = mi.load_dict({"type": "independent", "seed": base}), 64
     reference.seed(7, count)
     sampler_copy = make_strip_sampler(1, base, 7, 0, count)
-    # If a release of Mitsuba seeds differently, images are rendered undivided and stay correct.
-    return base if dr.all(reference.next_2d() == sampler_copy.next_2d(), axis=None) else None
+    return bool(dr.all(reference.next_2d() == sampler_copy.next_2d(), axis=None))
 
 
 def make_strip_sampler(spp: int, base: int, seed: int, first: int, count: int):
@@ -178,11 +204,19 @@ def make_strip_sampler(spp: int, base: int, seed: int, first: int, count: int):
     import drjit as dr
 
     mi = variant_types()
-    number = dr.opaque(mi.UInt64, first) + mi.UInt64(dr.arange(mi.UInt32, count))
+    return make_sampler(spp, dr.opaque(mi.UInt32, (base + seed) & 0xFFFFFFFF), dr.opaque(mi.UInt64, first), count)
+
+
+def make_sampler(spp: int, key: Any, first: Any, count: int):
+    """Make the sampler of `make_strip_sampler` from Dr.Jit numbers, which are not compiled into the kernel: the sum
+    ``key`` of base and seed, and the first sample."""
+    import drjit as dr
+
+    mi = variant_types()
+    number = first + mi.UInt64(dr.arange(mi.UInt32, count))
     low = mi.UInt32(number & 0xFFFFFFFF)
     high = mi.UInt32(number >> 32)
-    key = dr.opaque(mi.UInt32, (base + seed) & 0xFFFFFFFF) + high * 0x9E3779B9
-    state, stream = mi.sample_tea_32(key, low)
+    state, stream = mi.sample_tea_32(key + high * 0x9E3779B9, low)
     return _get_sampler_class(mi.variant())(spp, mi.PCG32(initstate=mi.UInt64(state), initseq=mi.UInt64(stream)))
 
 
@@ -237,6 +271,17 @@ class ObserverIntegrator(Protocol):
         ...
 
 
+def has_context(integrator: Any) -> bool:
+    """Whether ``integrator`` is an `ObserverIntegrator`."""
+    return _has_context(type(integrator))
+
+
+@functools.cache
+def _has_context(kind: type) -> bool:
+    # Python takes .2 ms to compare an object with a protocol.
+    return issubclass(kind, ObserverIntegrator)
+
+
 @dataclass(frozen=True)
 class Band:
     """A band of rows of an image.
@@ -268,7 +313,7 @@ def undividable_reason(scene, sensor) -> str | None:
         return f"the variant {mi.variant()}"
     if not isinstance(integrator, mi.SamplingIntegrator) or isinstance(integrator, mi.CppADIntegrator):
         return f"the integrator {integrator.class_name()}"
-    if not isinstance(integrator, ObserverIntegrator) and _overrides_render(type(integrator), mi.SamplingIntegrator):
+    if not has_context(integrator) and _overrides_render(type(integrator), mi.SamplingIntegrator):
         return f"the integrator {integrator.class_name()}, which overrides render()"
     if film.class_name() != "HDRFilm":
         return f"the film {film.class_name()}"
@@ -348,11 +393,10 @@ def render_bands(
         return
     grid = _PixelGrid(sensor.film(), spp or sensor.sampler().sample_count(), rows)
     integrator = scene.integrator()
-    layers = IntegratorLayer(integrator) if layers is None else layers
-    rendering_context = lambda: (
-        integrator.rendering_from(sensor, scene) if isinstance(integrator, ObserverIntegrator) else nullcontext()
-    )
-    base = get_base_seed(sensor.sampler())
+    if layers is None:
+        layers = AovLayer(integrator, sensor) if is_nerg(integrator) else IntegratorLayer(integrator)
+    rendering_context = lambda: integrator.rendering_from(sensor, scene) if has_context(integrator) else nullcontext()
+    base = cast("int", get_base_seed(sensor.sampler()))
     pace = pace or SamplePace()
     pace.begin()
     done = 0
@@ -361,14 +405,8 @@ def render_bands(
         start, stop = grid.sample_range(top)
         with rendering_context(), grid.match_accumulation(blocks[0], layers):
             for first, count in pace.iter_strips(start, stop, grid.spp):
-                positions, active, layer_values = _trace_strip(
-                    scene, sensor, layers, grid, base, seed, top, first, count, start
-                )
-                for block, values in zip(blocks, layer_values):
-                    block.put(positions, values, active)
-                    if len(blocks) > 1:
-                        # One kernel per layer, so that layers of the same kind share a kernel.
-                        _evaluate_block(block)
+                strip = _Strip.make(grid, base, seed, top, first, count, start)
+                _render_strip(scene, sensor, layers, grid, strip, blocks)
                 # This strip was traced while the previous one was computed.
                 pace.wait()
                 if on_strip is not None and done:
@@ -404,29 +442,90 @@ def _evaluate_block(block):
     dr.eval(block.tensor())
 
 
-def _trace_strip(scene, sensor, layers: LayerSource, grid: _PixelGrid, base, seed, top, first, count, start):
+@dataclass(frozen=True)
+class _Strip:
+    """A strip of ``count`` samples of an image. All other numbers are arrays of Dr.Jit, so that strips and images share
+    a kernel."""
+
+    count: int
+    # Key of the random numbers, and index of the first sample.
+    key: Any
+    first: Any
+    # Samples at the beginning of the strip that are masked.
+    masked: Any
+    # Position of the first sample: in its pixel, column and row.
+    sample: Any
+    column: Any
+    row: Any
+    # First row of the band.
+    top: Any
+    spp: Any
+
+    @classmethod
+    def make(cls, grid: _PixelGrid, base: int, seed: int, top: int, first: int, count: int, start: int) -> _Strip:
+        """The strip from the sample ``first`` in the band at ``top``, whose samples begin at ``start``."""
+        import drjit as dr
+
+        mi = variant_types()
+        number = lambda value: dr.opaque(mi.UInt32, value)
+        pixel = first // grid.spp
+        return cls(
+            count=count,
+            key=number((base + seed) & 0xFFFFFFFF),
+            first=dr.opaque(mi.UInt64, first),
+            masked=number(max(start - first, 0)),
+            sample=number(first % grid.spp),
+            column=number(pixel % grid.width),
+            row=number(pixel // grid.width),
+            top=dr.opaque(mi.Int32, top),
+            spp=number(grid.spp),
+        )
+
+    @property
+    def numbers(self) -> list[Any]:
+        """The arrays."""
+        return [self.key, self.first, self.masked, self.sample, self.column, self.row, self.top, self.spp]
+
+
+def _render_strip(scene, sensor, layers: LayerSource, grid: _PixelGrid, strip: _Strip, blocks: list[Any]) -> None:
+    """Trace a strip of samples, or replay it, and add it to ``blocks``, one per layer."""
+
+    def add() -> None:
+        positions, active, layer_values = _trace_strip(scene, sensor, layers, grid, strip)
+        for block, values in zip(blocks, layer_values):
+            block.put(positions, values, active)
+            if len(blocks) > 1:
+                # One kernel per layer, so that layers of the same kind share a kernel.
+                _evaluate_block(block)
+
+    if layers.recorder is None:
+        add()
+        return
+    list_inputs = lambda: cast("RecordableLayers", layers).list_inputs(scene, strip.count)
+    key = "strip", strip.count, grid.spp, grid.rows
+    layers.recorder.run(add, key, list_inputs, strip.numbers, sensor, blocks)
+
+
+def _trace_strip(scene, sensor, layers: LayerSource, grid: _PixelGrid, strip: _Strip):
     """Trace a strip of samples.
 
-    Samples before ``start`` are masked. Follows ``SamplingIntegrator::render_sample`` of Mitsuba 3.9, operation by
-    operation.
+    Follows ``SamplingIntegrator::render_sample`` of Mitsuba 3.9, operation by operation.
 
     Returns
     -------
     tuple
-        Positions in the block of the band at ``top``, the mask, and an iterator over the values in each layer.
+        Positions in the block of the band, the mask, and an iterator over the values in each layer.
     """
     import drjit as dr
 
     mi = variant_types()
-    film, spp = sensor.film(), grid.spp
-    sampler = make_strip_sampler(spp, base, seed, first, count)
-    # Opaque numbers are not compiled into the kernel, so that all strips share it.
-    number = dr.arange(mi.UInt32, count)
-    active = number >= dr.opaque(mi.UInt32, max(start - first, 0))
-    number += dr.opaque(mi.UInt32, first % spp)
-    number = number // dr.opaque(mi.UInt32, spp) + dr.opaque(mi.UInt32, first // spp % grid.width)
+    film = sensor.film()
+    sampler = make_sampler(grid.spp, strip.key, strip.first, strip.count)
+    number = dr.arange(mi.UInt32, strip.count)
+    active = number >= strip.masked
+    number = (number + strip.sample) // strip.spp + strip.column
     line = number // grid.width
-    pixel = mi.Vector2i(number - line * grid.width, line + dr.opaque(mi.UInt32, first // spp // grid.width))
+    pixel = mi.Vector2i(number - line * grid.width, line + strip.row)
     pixel += mi.Vector2i(film.crop_offset()) - grid.border
 
     position = mi.Vector2f(pixel) + sampler.next_2d(active)
@@ -439,12 +538,12 @@ def _trace_strip(scene, sensor, layers: LayerSource, grid: _PixelGrid, base, see
         time = time + sampler.next_1d(active) * sensor.shutter_open_time()
     ray, weight = sensor.sample_ray_differential(time, 0, relative, aperture, active)
     if ray.has_differentials:
-        ray.scale_differential(mi.Float(np.float32(1) / np.sqrt(np.float32(spp))))
+        ray.scale_differential(mi.Float(np.float32(1) / np.sqrt(np.float32(grid.spp))))
     layer_samples = layers.sample(scene, sampler, ray, sensor.get_medium(), active)
     # With a box filter, use the pixel itself: the position can be rounded up into the next pixel.
     block_position = mi.Point2f(pixel) if film.rfilter().is_box_filter() else mi.Point2f(position)
     if grid.is_divided:
-        block_position -= mi.Vector2f(mi.Vector2i(film.crop_offset()) + mi.Vector2i(0, dr.opaque(mi.Int32, top)))
+        block_position -= mi.Vector2f(mi.Vector2i(film.crop_offset()) + mi.Vector2i(0, strip.top))
     return block_position, active, (_make_block_values(film, weight, *of_layer) for of_layer in layer_samples)
 
 
@@ -612,7 +711,7 @@ def read_channels(film, aov_names: Sequence[str]) -> Channels:
 
 
 class AovLayer:
-    """A layer with colour and chosen AOVs, for the observer of the scene.
+    """A layer with colour and AOVs of `nerg`, for the observer of the scene.
 
     Parameters
     ----------
@@ -620,8 +719,9 @@ class AovLayer:
         The integrator of the scene.
     sensor : mi.Sensor
         The camera.
-    aovs : sequence of str
-        Names of AOVs, which the scene file need not list.
+    aovs : sequence of str, optional
+        Names of AOVs, which the scene file need not list. Default: those of the integrator, followed by those of its
+        nested integrator.
 
     Raises
     ------
@@ -629,16 +729,25 @@ class AovLayer:
         The integrator cannot compute one of the AOVs.
     """
 
-    def __init__(self, integrator: Any, sensor: Any, aovs: Sequence[str]):
-        self._sensor, self._context = sensor, integrator.make_context(aovs, True)
-        self.channel_names = [self._context.channel_names(self._context.aovs)]
+    def __init__(self, integrator: Any, sensor: Any, aovs: Sequence[str] | None = None):
+        self.recorder: Recorder | None = integrator.recorder
+        self._sensor = sensor
+        self._context = integrator.context() if aovs is None else integrator.make_context(aovs, True)
+        self._has_nested, self._observer = aovs is None, None
+        self.channel_names = [integrator.aov_names() if aovs is None else self._context.channel_names(aovs)]
         self.num_channels = len(self.channel_names[0])
+
+    def list_inputs(self, scene: Any, num_rays: int) -> list[Any]:
+        if self._context.observer_aovs:
+            self._observer = self._observer or self._context.make_own_observer([self._sensor])
+            self._observer.prepare(self._context, scene, [self._sensor], num_rays)
+        return [*self._context.list_inputs(scene), self._observer]
 
     def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any, active: Any) -> Iterable[tuple]:
         camera = self._context.trace(scene, [self._sensor], sampler, ray, active)
-        channels = camera.make_pixel().compute_channels(self._context.aovs)
-        radiance, shown, _ = camera.compute_radiance(scene, sampler, medium)
-        return [(radiance, shown, channels)]
+        channels = camera.make_pixel(self._observer).compute_channels(self._context.aovs)
+        radiance, shown, nested = camera.compute_radiance(scene, sampler, medium)
+        return [(radiance, shown, channels + nested if self._has_nested else channels)]
 
 
 def is_nerg(integrator: Any) -> bool:

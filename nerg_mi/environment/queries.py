@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,11 +17,13 @@ from nerg_mi.maths.types import variant_types
 from nerg_mi.progress import SILENT, Progress, Reporter, open_reporter
 
 from .arrays import Floats, LabelledArrays, as_points, as_rays, broadcast_to_observers
+from .bands import make_sampler
 from .scene import COLOR, Scene, make_aov_context, resolve_quantities
 from .scene_loading import activate_mitsuba
 
 if TYPE_CHECKING:
     from nerg_mi.transport.geometry import SceneGeometry
+    from nerg_mi.transport.occlusion import ObserverMap
 
 # ---- One observer of a scene ----
 
@@ -53,6 +56,16 @@ class SceneObserver:
         if scene.has_gaze:
             i = self.integrator
             self.gaze = i.gaze.for_observers([self.center], self.geometry, i.observer_settings, i.cache)
+
+    @cached_property
+    def map(self) -> ObserverMap | None:
+        """The depth map around the observer; None unless visibility is decided by a map."""
+        from nerg_mi.transport.occlusion import get_observer_map
+
+        settings = self.integrator.observer_settings
+        if settings.visibility != "map":
+            return None
+        return get_observer_map(self.geometry, self.center, settings, None, self.integrator.cache)
 
     def eval_gaze(self, p_od: Any, p_o: Any, r_o: Any, active: Any) -> Any:
         """Evaluate the gaze density.
@@ -105,7 +118,7 @@ class SceneObserver:
         active = dr.full(mi.Bool, True, dr.width(points))
         ray = mi.Ray3f(self.center, r_o)
         hit = trace_from_observer(
-            self.geometry, ray, points, self.center, 0, active, i.falloff, i.observer_settings, cache=i.cache
+            self.geometry, ray, points, self.center, 0, active, i.falloff, i.observer_settings, observer_map=self.map
         )
         values = {"distance": distance, "depth": hit.depth, "visibility": hit.visibility}
         if with_gaze:
@@ -227,7 +240,8 @@ class _Tracer:
         observers = (
             [self.context.make_observer(eye, len(positions) == 1) for eye in positions] if self.per_observer else []
         )
-        parts = [self._trace_batch(o, d, a, lambda camera: map(camera.make_pixel, observers)) for a in _batch_starts(o)]
+        make_pixels = lambda camera: map(camera.make_pixel, observers)
+        parts = [self._trace_batch(o, d, a, make_pixels, observers) for a in _batch_starts(o)]
         values = {}
         for name in self.requested:
             value = np.concatenate([part[name] for part in parts], axis=-1 if name in self.per_observer else 0)
@@ -237,12 +251,13 @@ class _Tracer:
     def trace_for_origins(self, o: Floats, d: Floats) -> dict[str, Floats]:
         """Compute quantities (N, ...) of rays for observers at their origins."""
         if not self.per_observer:
-            parts = [self._trace_batch(o, d, a, lambda camera: ()) for a in _batch_starts(o)]
+            parts = [self._trace_batch(o, d, a, lambda camera: (), ()) for a in _batch_starts(o)]
             return {name: np.concatenate([part[name] for part in parts]) for name in self.requested}
         gaze = self.context.nerg.gaze
         if self.context.views or (gaze is not None and gaze.field.config.normalized):
             return self._trace_each_origin(o, d)
-        parts = [self._trace_batch(o, d, a, lambda camera: (camera.make_pixel_per_origin(),)) for a in _batch_starts(o)]
+        make_pixels = lambda camera: (camera.make_pixel_per_origin(),)
+        parts = [self._trace_batch(o, d, a, make_pixels, ()) for a in _batch_starts(o)]
         first = lambda name, value: value[0] if name in self.per_observer else value
         return {name: np.concatenate([first(name, part[name]) for part in parts]) for name in self.requested}
 
@@ -254,40 +269,57 @@ class _Tracer:
         parts = []
         for number, (origin, rows) in enumerate(zip(origins, groups), 1):
             observer = self.context.make_observer(origin)
+            observer.is_at_camera = True
             for a in _batch_starts(rows):
-                part = self._trace_batch(
-                    o[rows], d[rows], a, lambda camera, who=observer: (camera.make_pixel(who, True),)
-                )
+                make_pixels = lambda camera, who=observer: (camera.make_pixel(who),)
+                part = self._trace_batch(o[rows], d[rows], a, make_pixels, [observer])
                 parts.append({name: v[0] if name in self.per_observer else v for name, v in part.items()})
             self.reporter.progress(number / len(origins), f"origin {number:,} of {len(origins):,}")
         inverse = np.argsort(order)
         return {name: np.concatenate([part[name] for part in parts])[inverse] for name in self.requested}
 
     def _trace_batch(
-        self, o: Floats, d: Floats, start: int, make_pixels: Callable[[Any], Iterable[Any]]
+        self, o: Floats, d: Floats, start: int, make_pixels: Callable[[Any], Iterable[Any]], observers: Sequence[Any]
     ) -> dict[str, Floats]:
-        """Trace `BATCH_SIZE` rays from index ``start``; ``make_pixels`` returns the pixels of each observer."""
+        """Trace `BATCH_SIZE` rays from index ``start``, or replay a recording of it.
+
+        ``make_pixels`` returns the pixels of each of ``observers``; without any, those of rays whose observers are at
+        their origins.
+        """
         import drjit as dr
         import mitsuba as mi
 
+        context, scene = self.context, self.scene.mitsuba
         o, d = o[start : start + BATCH_SIZE], d[start : start + BATCH_SIZE]
-        ray = mi.RayDifferential3f(to_vector(mi.Point3f, o), to_vector(mi.Vector3f, d))
-        sampler = mi.load_dict({"type": "independent"})
-        sampler.seed(self.seed + start, len(o))
-        with dr.suspend_grad():
-            camera = self.context.trace(self.scene.mitsuba, [], sampler, ray, mi.Bool(True))
-            shared = camera.compute_channels(self.shared)
-            color = camera.compute_radiance(self.scene.mitsuba, sampler, None)[0]
-            camera.eval_shared(color, shared)
-            each = []
-            for pixels in make_pixels(camera) if self.per_observer else ():
-                channels = pixels.compute_channels(self.per_observer)
-                dr.eval(channels)
-                each.append(self._group_channels(self.per_observer, channels, len(o)))
+        origin, direction = to_vector(mi.Point3f, o), to_vector(mi.Vector3f, d)
+        key, first = dr.opaque(mi.UInt32, (self.seed + start) & 0xFFFFFFFF), dr.opaque(mi.UInt64, 0)
+
+        def list_inputs() -> list[Any]:
+            for observer in observers:
+                observer.prepare(context, scene, [], len(o))
+            return [*context.list_inputs(scene), observers]
+
+        def trace() -> tuple[list[Any], list[Any], list[list[Any]]]:
+            with dr.suspend_grad():
+                sampler = make_sampler(1, key, first, len(o))
+                ray = mi.RayDifferential3f(origin, direction)
+                camera = context.trace(scene, [], sampler, ray, mi.Bool(True))
+                shared = camera.compute_channels(self.shared)
+                color = list(camera.compute_radiance(scene, sampler, None)[0])
+                camera.eval_shared(color, shared)
+                each = []
+                for pixels in make_pixels(camera) if self.per_observer else ():
+                    each.append(pixels.compute_channels(self.per_observer))
+                    dr.eval(each[-1])
+            return shared, color, each
+
+        kind = "trace", len(o), *self.shared, *self.per_observer
+        shared, color, each = context.nerg.recorder.run(trace, kind, list_inputs, [origin, direction, key, first])
         values = self._group_channels(self.shared, shared, len(o))
         if COLOR in self.requested:
             values[COLOR] = np.stack([_to_array(channel, len(o)) for channel in color], axis=-1)
-        return values | {name: np.stack([one[name] for one in each]) for name in self.per_observer}
+        by_observer = [self._group_channels(self.per_observer, channels, len(o)) for channels in each]
+        return values | {name: np.stack([one[name] for one in by_observer]) for name in self.per_observer}
 
     def _group_channels(self, names: Sequence[str], channels: Sequence[Any], count: int) -> dict[str, Floats]:
         """Return channels by quantity, as arrays (N,), or (N, C) for several channels."""
@@ -380,22 +412,40 @@ def resolve_observers(scene: Scene, observers: ArrayLike | None, reporter: Repor
 
 def warn_extrapolation(reporter: Reporter, scene: Scene, positions: Floats) -> None:
     """Warn if values at ``positions`` (M, 3) are extrapolated; a silent reporter takes no time."""
-    from nerg_mi.transport import extrapolation
+    from nerg_mi.transport.extrapolation import describe_extrapolation
+    from nerg_mi.transport.observer import fingerprint_geometry
 
-    if reporter is not SILENT:
-        extrapolation.warn_extrapolation(reporter.warn, scene.geometry, scene.integrator.gaze, positions)
+    if reporter is SILENT:
+        return
+    geometry, integrator = scene.geometry, scene.integrator
+    dependencies = positions.tobytes(), integrator.gaze, fingerprint_geometry(geometry)
+    describe = lambda: describe_extrapolation(geometry, integrator.gaze, positions)
+    if sentence := integrator.cache.get_or_compute_value("extrapolation", dependencies, describe):
+        reporter.warn(sentence)
 
 
 def _observe_points(observer: SceneObserver, p: Floats, with_gaze: bool) -> dict[str, Floats]:
     import drjit as dr
     import mitsuba as mi
 
-    parts: dict[str, list[Floats]] = {}
+    context, scene = observer.integrator.context(), observer.scene.mitsuba
+    recorder, parts = observer.integrator.recorder, dict[str, list[Floats]]()
+
+    def list_inputs() -> list[Any]:
+        if observer.gaze is not None:
+            observer.gaze.prepare(len(part))
+        return [*context.list_inputs(scene), observer.center, observer.gaze, observer.map]
+
+    def observe() -> dict[str, Any]:
+        with dr.suspend_grad():
+            values = observer.observe(points, with_gaze)
+            dr.eval(values)
+        return values
+
     for a in range(0, len(p), BATCH_SIZE):
         part = p[a : a + BATCH_SIZE]
-        with dr.suspend_grad():
-            values = observer.observe(to_vector(mi.Point3f, part), with_gaze)
-            dr.eval(values)
+        points = to_vector(mi.Point3f, part)
+        values = recorder.run(observe, ("observe", len(part), with_gaze), list_inputs, [points])
         for name, value in values.items():
             parts.setdefault(name, []).append(_to_array(value, len(part)))
     return {name: np.concatenate(values) for name, values in parts.items()}

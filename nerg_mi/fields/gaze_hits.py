@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 import drjit as dr
 import numpy as np
 
+from nerg_mi.maths.arrays import copy_aligned
 from nerg_mi.maths.sphere import aim
 from nerg_mi.maths.types import Float, Point3f, Vector3f
 from nerg_mi.maths.vmf import log_normaliser
@@ -105,6 +106,9 @@ class ReaimedHits:
     ValueError
         For arrays that do not match or are not finite, and for kernels out of range.
     """
+
+    # Only the kernels are evaluated on devices.
+    UNRECORDED = ("origins", "points", "extent", "_tree", "_thinned", "_levels", "_recorded_directions")
 
     def __init__(self, origins: np.ndarray, points: np.ndarray, kernels: Sequence[HitKernel]):
         self.origins, self.points = (np.ascontiguousarray(a, np.float32).reshape(-1, 3) for a in (origins, points))
@@ -250,11 +254,14 @@ def place_missing_points(
 class ObservedHits:
     """The density of re-aimed hits for one observer, or for several without a table."""
 
+    # Derivatives need them.
+    UNRECORDED = ("_neighbours",)
+
     def __init__(
         self, kernels: Sequence[HitKernel], neighbours: Sequence[HitNeighbours], extent: float, ns: ModuleType
     ):
         self._kernels, self._neighbours, self._extent, self._ns = kernels, neighbours, extent, ns
-        self._uniform_weights = [ns.Float(near.uniform_weight.astype(np.float32)) for near in neighbours]
+        self._uniform_weights = [ns.Float(copy_aligned(near.uniform_weight, np.float32)) for near in neighbours]
         self._kdes = [_make_kde(near, kernel.kappa, ns) for kernel, near in zip(kernels, neighbours)]
         self._tables: list[SphericalKdeTable | None] = [None] * len(kernels)
         total = sum(kernel.weight for kernel in kernels)
@@ -276,7 +283,8 @@ class ObservedHits:
 
     def prepare(self, lanes: int) -> None:
         """Tabulate the kernels of a single observer for which that is faster for ``lanes`` directions."""
-        if lanes < _MIN_TABLE_LANES or self._kdes[0].count > 1:
+        # A function that dr.freeze records cannot read the kernels: it takes the tables that there are.
+        if lanes < _MIN_TABLE_LANES or self._kdes[0].count > 1 or dr.flag(dr.JitFlag.FreezingScope):
             return
         for k, kde in enumerate(self._kdes):
             if self._tables[k] is None and SphericalKdeTable.is_worthwhile(kde, lanes):

@@ -14,7 +14,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.maths import vmf
-from nerg_mi.maths.arrays import check_weights, kahan_add, to_vector
+from nerg_mi.maths.arrays import check_weights, copy_aligned, kahan_add, to_vector
 from nerg_mi.maths.types import Array3f, Float, UInt32
 from nerg_mi.maths.vmf import log_normaliser
 
@@ -233,16 +233,15 @@ class SphericalKde:
             backend if isinstance(backend, ModuleType) else namespace(backend or get_default_backend())
         )
         # Four floats per ray, so that direction and weight are loaded by one gather.
-        packed = np.concatenate([rays, ray_weights[:, None]], axis=1).astype(np.float32)
-        self._rays = self.ns.Float(packed.ravel())
-        self._offsets = self.ns.UInt32(offsets.astype(np.uint32))
-        self._kappa = self.ns.Float(kappa.astype(np.float32))
-        self._log_c = self.ns.Float(log_normaliser(kappa).astype(np.float32))
-
-    @property
-    def kappa(self) -> np.ndarray:
+        packed = np.concatenate([rays, ray_weights[:, None]], axis=1)
+        # Aligned alike for all probes: recordings of dr.freeze distinguish arrays by their alignment.
+        self._rays = self.ns.Float(copy_aligned(packed.ravel(), np.float32))
+        self._offsets = self.ns.UInt32(copy_aligned(offsets, np.uint32))
+        # Also kept here: to read it from a device would wait for all kernels.
+        self.kappa = copy_aligned(kappa, np.float32)
         """Concentration κ of the von Mises-Fisher kernel of each of the P probes, (P,) float32."""
-        return np.array(self._kappa)
+        self._kappa = self.ns.Float(self.kappa)
+        self._log_c = self.ns.Float(copy_aligned(log_normaliser(kappa), np.float32))
 
     def select_range(self, first: int, last: int) -> SphericalKde:
         """Return the kernel density estimates of the probes with indices ``first`` to ``last`` - 1."""

@@ -20,6 +20,7 @@ from nerg_mi.files.values import FilePath
 from nerg_mi.maths.types import Axes, Figure, Sensor
 from nerg_mi.progress import Progress, Reporter, open_reporter
 from nerg_mi.ranges import SEEDS, SPP, Range, check_number
+from nerg_mi.transport.recording import Recorder
 
 from .style import show_figure
 
@@ -196,6 +197,7 @@ class _ObserverLayers:
 
     def __init__(self, context: Any, sensor: Any, requested: Sequence[str], positions: Floats):
         self.sensor, self.color, self.num_observers = sensor, COLOR in requested, len(positions)
+        self.recorder: Recorder | None = context.nerg.recorder
         self.context = context
         self.shared, self.per_observer = context.shared_aovs, context.observer_aovs
         self.observer_contexts = (
@@ -206,6 +208,11 @@ class _ObserverLayers:
             [shared, *(per_observer for _ in self.observer_contexts)],
             len(shared) + len(per_observer),
         )
+
+    def list_inputs(self, scene: Any, num_rays: int) -> list[Any]:
+        for observer in self.observer_contexts:
+            observer.prepare(self.context, scene, [self.sensor], num_rays)
+        return [*self.context.list_inputs(scene), self.observer_contexts]
 
     def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any, active: Any) -> Iterator[tuple]:
         camera = self.context.trace(scene, [self.sensor], sampler, ray, active)

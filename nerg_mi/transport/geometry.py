@@ -46,6 +46,8 @@ class Ceiling:
     same kernel. Raises `NergError` if ``up`` is not a direction.
     """
 
+    UNRECORDED = ("height", "up")
+
     def __init__(self, height: float, up: ArrayLike = (0.0, 0.0, 1.0)):
         direction = np.asarray(up, float)
         length = float(np.linalg.norm(direction))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, cast
 
 import drjit as dr
 import numpy as np
@@ -38,6 +38,10 @@ if TYPE_CHECKING:
 class CacheEntry:
     """``value``: computed for the observer at ``center`` (one lane, detached)."""
 
+    # Only needed to choose between several observers. It can be the array of the observer's position, or one of an
+    # earlier observer at the same place, which are different inputs of a recording.
+    UNRECORDED: ClassVar[tuple[str, ...]] = ("center",)
+
     center: Point3f
     value: Any
 
@@ -64,6 +68,7 @@ class ObserverCache:
 
     def __init__(self, scalar_cache: ObserverCache | None = None) -> None:
         self._slots: dict[Hashable, _CacheSlot] = {}
+        self._values: dict[Hashable, tuple[Any, Any]] = {}
         self._numbers = scalar_cache or self
 
     def get_or_compute_each(
@@ -124,6 +129,13 @@ class ObserverCache:
         self._slots[key] = _CacheSlot(dependencies, dict(other_entries[-max_others:] if max_others else []) | requested)
         return out
 
+    def get_or_compute_value(self, key: Hashable, dependencies: Any, compute: Callable[[], Any]) -> Any:
+        """``compute()``, or its last result if the ``dependencies`` were equal; reads no positions."""
+        slot = self._values.get(key)
+        if slot is None or slot[0] != dependencies:
+            slot = self._values[key] = dependencies, compute()
+        return slot[1]
+
     def peek(self, key: Hashable) -> list[CacheEntry]:
         """The cached entries of ``key``; computes none."""
         slot = self._slots.get(key)
@@ -132,6 +144,7 @@ class ObserverCache:
     def clear(self) -> None:
         """Remove all entries, after a change that no array shows."""
         self._slots.clear()
+        self._values.clear()
 
 
 def fingerprint_geometry(geometry: SceneGeometry) -> tuple[Fingerprint, Fingerprint]:
@@ -356,10 +369,8 @@ class ObserverView(Protocol):
         ...
 
 
-def evaluate_view(
-    view: ObserverView, observers: list[Point3f], p_o: Point3f, r_o: Vector3f, cache: ObserverCache
-) -> Float:
-    """Evaluate ``view`` along ``r_o`` for the one of ``observers`` (one lane each) nearest to ``p_o``, lane by lane.
+def observe_view(view: ObserverView, observers: list[Point3f], cache: ObserverCache) -> list[CacheEntry]:
+    """``view`` for each of ``observers`` (one lane each), kept in ``cache``.
 
     Raises
     ------
@@ -371,8 +382,7 @@ def evaluate_view(
             "an AOV depends on the position of the observer, which cannot be read while dr.freeze records a function; "
             'remove it from "aovs"'
         )
-    entries = cache.get_or_compute_each(view, observers, (), view.for_position)
-    return select_nearest(entries, p_o, lambda value: value.evaluate(r_o))
+    return cache.get_or_compute_each(view, observers, (), view.for_position)
 
 
 class SupportView:

@@ -59,6 +59,8 @@ class ObserverDepthMap:
     pixel centres.
     """
 
+    UNRECORDED = ("center",)  # As of `CacheEntry`
+
     def __init__(self, geometry: SceneGeometry, center: Point3f, settings: ObserverSettings):
         mi = variant_types()
         self.height, self.width, self.center = settings.map_height, 2 * settings.map_height, center
@@ -184,8 +186,7 @@ def trace_from_observer(
     settings: ObserverSettings,
     *,
     count: bool = False,
-    gaze: ObservedGaze | None = None,
-    cache: ObserverCache | None = None,
+    observer_map: ObserverMap | None = None,
     needs_depth: bool = True,
     num_rays: int = 0,
 ) -> ObserverHit:
@@ -201,10 +202,8 @@ def trace_from_observer(
         d_f in scene units.
     count : bool
         Count density evaluations.
-    gaze : ObservedGaze, optional
-        The gaze field whose density a map also stores, unless gradients need the field itself.
-    cache : ObserverCache, optional
-        Keeps the map.
+    observer_map : ObserverMap, optional
+        The map around ``p_o``, if visibility is decided by a map. Default: a temporary one, without gaze.
     needs_depth : bool
         Whether the depth and the surface are needed even where visibility is 0 or 1 without them. If false, rays may
         end early, and the returned depth is only on the correct side of the point.
@@ -222,7 +221,8 @@ def trace_from_observer(
     density = None
 
     if settings.visibility == "map":
-        depth_map, table = _get_depth_map(geometry, p_o, settings, gaze, cache or ObserverCache())
+        observer_map = observer_map or get_observer_map(geometry, p_o, settings, None, ObserverCache())
+        depth_map, table = observer_map.depths, observer_map.gaze
         observed_depth, visible = depth_map.eval_visibility(r_o, distance, falloff, tolerance, active)
         if table is not None:
             # Of the surface itself: the target in front of it lies in another direction.
@@ -290,21 +290,30 @@ def shape_tolerance(geometry: SceneGeometry, settings: ObserverSettings, shape: 
     return RELATIVE_TOLERANCE * min(diagonal, near) + _FAR * diagonal
 
 
-def _get_depth_map(
+@dataclass(frozen=True, eq=False)
+class ObserverMap:
+    """The depths around an observer, and the table of their gaze; None without gaze, or if it carries gradients."""
+
+    depths: ObserverDepthMap
+    gaze: Float | None
+
+
+def get_observer_map(
     geometry: SceneGeometry, p_o: Point3f, settings: ObserverSettings, gaze: ObservedGaze | None, cache: ObserverCache
-) -> tuple[ObserverDepthMap, Float | None]:
-    """The observer's depth map, and the table of ``gaze`` for it (None without gaze, or if it carries gradients)."""
+) -> ObserverMap:
+    """The map of the observer at ``p_o`` (one lane) in ``geometry``, kept in ``cache``; ``gaze``: the gaze field whose
+    density it also stores."""
     dependencies = (fingerprint_geometry(geometry), settings.surface_settings, settings.map_height)
     compute = lambda center: ObserverDepthMap(geometry, center, settings)
     entries = cache.get_or_compute_each("map", [p_o], dependencies, compute)
     depth_map = entries[0].value
     if gaze is None or dr.grad_enabled(p_o, *gaze.parameters()):
-        return depth_map, None
+        return ObserverMap(depth_map, None)
     table_dependencies = (depth_map, gaze.dependencies)
     table = cache.get_or_compute("gaze of map", entries, table_dependencies, lambda k: k.value.make_gaze_table(gaze))[
         0
     ].value
-    return depth_map, table
+    return ObserverMap(depth_map, table)
 
 
 def _evaluations(ray_hit: RayHit) -> Float | None:

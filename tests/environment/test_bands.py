@@ -287,6 +287,7 @@ class TwoLayers:
 
     def __init__(self, integrator):
         self.integrator, self.channel_names, self.num_channels = integrator, [integrator.aov_names(), ["twice.T"]], 3
+        self.recorder = None
 
     def sample(self, *ray):
         radiance, valid, aovs = self.integrator.sample(*ray)

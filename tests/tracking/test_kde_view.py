@@ -9,7 +9,7 @@ from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.sphere import fibonacci_directions, sample_uniform_directions
 from nerg_mi.tracking.kde_view import MIN_TABLE_DIRECTIONS, KdeView
 from nerg_mi.tracking.rays import Rays
-from nerg_mi.transport.observer import ObserverCache, evaluate_view
+from nerg_mi.transport.observer import ObserverCache, observe_view, select_nearest
 from tests.reference.kde import kde as reference
 
 
@@ -61,7 +61,8 @@ def test_each_lane_has_the_density_of_its_observer(rgb, rays_view):
     observers = [points(is_valid[k : k + 1]) for k in (0, 1)]
     for k in (0, 1):
         p_o = points(np.repeat(is_valid[k : k + 1], 50, axis=0))
-        value = evaluate_view(view, observers, p_o, points(d @ turn[:3, :3].T / 2), ObserverCache())
+        entries = observe_view(view, observers, ObserverCache())
+        value = select_nearest(entries, p_o, lambda value: value.evaluate(points(d @ turn[:3, :3].T / 2)))
         assert np.allclose(value.numpy(), expected(rays_view, origins[k], d), rtol=1e-4, atol=1e-6)
 
 

@@ -22,8 +22,9 @@ from nerg_mi.transport.observer import (
     ObserverCache,
     ObserverSettings,
     SupportView,
-    evaluate_view,
     fingerprint_geometry,
+    observe_view,
+    select_nearest,
 )
 from nerg_mi.transport.volume_medium import VolumeMedium
 from tests.plugins.scenes import plugin
@@ -330,7 +331,8 @@ def test_view_is_created_once_per_observer(rgb):
     positions = [rgb.Point3f(1, 0, 0), rgb.Point3f(5, 0, 0)]
     p_o, r_o = rgb.Point3f([1, 5, 5], 0, 0), rgb.Vector3f([0.1, 0.2, 0.3], 0, 0)
     for _ in range(2):
-        assert np.allclose(evaluate_view(view, positions, p_o, r_o, cache).numpy(), [1.1, 5.2, 5.3])
+        value = select_nearest(observe_view(view, positions, cache), p_o, lambda value: value.evaluate(r_o))
+        assert np.allclose(value.numpy(), [1.1, 5.2, 5.3])
         assert view.made == 2
 
 
@@ -339,7 +341,7 @@ def test_views_are_refused_in_frozen_functions(rgb):
 
     @dr.freeze
     def frozen(p):
-        return evaluate_view(Counting(), [p], p, rgb.Vector3f(0, 0, 1), cache)
+        return observe_view(Counting(), [p], cache)[0].value.evaluate(rgb.Vector3f(0, 0, 1))
 
     with pytest.raises(RuntimeError) as refused:
         frozen(rgb.Point3f(rgb.Float([1]), 0, 0))

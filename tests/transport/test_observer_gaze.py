@@ -31,7 +31,7 @@ from nerg_mi.transport.observer_gaze import (
     integrate_sphere,
     interpolate_nearest_depth,
 )
-from nerg_mi.transport.occlusion import trace_from_observer
+from nerg_mi.transport.occlusion import get_observer_map, trace_from_observer
 from tests.evaluation.gaze_fields import made
 from tests.fields.gaze.test_log_density import BOX, SMALL
 from tests.plugins.scenes import plugin
@@ -297,8 +297,9 @@ def test_cache_distinguishes_integral_tolerances(rgb):
     def ask(cache, **settings):
         selected = replace(SETTINGS, directions=1 << 15, visibility="map", map_height=16, **settings)
         observed = gaze.for_observers([eye], place, selected, cache)
+        around = get_observer_map(place, eye, selected, observed, cache)
         sight = trace_from_observer(
-            place, ray, point, eye, rgb.Float(0), rgb.Bool(True), 0.0, selected, gaze=observed, cache=cache
+            place, ray, point, eye, rgb.Float(0), rgb.Bool(True), 0.0, selected, observer_map=around
         )
         return float(observed.integrals(eye)[0][0]), float(sight.gaze[0])
 

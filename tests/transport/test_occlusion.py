@@ -10,7 +10,7 @@ import pytest
 from nerg_mi.transport.geometry import SceneGeometry
 from nerg_mi.transport.march_primal import MarchSettings
 from nerg_mi.transport.observer import ObserverCache, ObserverSettings
-from nerg_mi.transport.occlusion import ObserverDepthMap, trace_from_observer, visibility
+from nerg_mi.transport.occlusion import ObserverDepthMap, get_observer_map, trace_from_observer, visibility
 from nerg_mi.transport.volume_medium import VolumeMedium
 
 # ---- Depth map ----
@@ -154,6 +154,7 @@ def look(
     tolerance=0.0,
     falloff=0.0,
     dt_gamma=0.0,
+    cache=None,
     **overrides,
 ):
     """What an observer at ``p_o`` sees of the point ``p_d`` on a camera's ray."""
@@ -161,7 +162,9 @@ def look(
     ray = mi.Ray3f(mi.Point3f(*map(float, o)), mi.Vector3f(*map(float, (p_d - o) / np.linalg.norm(p_d - o))))
     march = MarchSettings(STEP, dt_gamma=dt_gamma)
     settings = ObserverSettings(march=march, visibility=kind, tolerance=tolerance, map_height=64)
-    points = (mi.Point3f(*map(float, p)) for p in (p_d, p_o))
+    points = [mi.Point3f(*map(float, p)) for p in (p_d, p_o)]
+    if cache is not None:
+        overrides["observer_map"] = get_observer_map(place, points[1], settings, None, cache)
     return trace_from_observer(
         place, ray, *points, penetration, mi.Bool(True), mi.Float(falloff), settings, **overrides
     )

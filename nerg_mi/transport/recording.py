@@ -1,0 +1,311 @@
+"""Recordings: what was traced for one image is replayed for the next ones by ``dr.freeze``.
+
+Tracing a small image takes longer than its kernels. Dr.Jit can replay the kernels of a function with other arrays, if
+it is told all arrays that the function reads; everything else is repeated as it was when the function was recorded. A
+traced program reads objects: an integrator, its fields, observers. `State` divides all that they contain into arrays,
+which are the inputs of a recording, and other values, which belong to its key: if one of these changes, the function is
+traced again. An evaluated array that is not an input is an error of Dr.Jit, not an outdated image.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Hashable, Iterable, Sequence
+from enum import Enum
+from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
+from typing import Any
+
+import drjit as dr
+import drjit.nn as nn
+import numpy as np
+
+from .jit import gc_paused, is_recording
+
+# ---- State ----
+
+_MAX_COMPARED_BYTES = 1 << 10
+"""Size up to which arrays of NumPy are compared by their values, and not by their identity."""
+
+
+class NotRecordable(Exception):
+    """Why a function cannot be recorded, as the end of a sentence."""
+
+
+class State:
+    """All that ``roots`` contain, in a fixed order.
+
+    Attributes of Python objects are followed, except those that their class names in ``UNRECORDED``: attributes that no
+    traced program reads, or that it reads only with derivatives. Raises `NotRecordable` for an object of Mitsuba, whose
+    state Python cannot list.
+
+    Attributes
+    ----------
+    arrays : list
+        The Dr.Jit arrays.
+    key : list
+        Everything else, comparable with ``==``; objects without attributes by their identity.
+    held : list
+        The objects that are compared by identity, which must live as long as the key.
+    """
+
+    __slots__ = ("_numbers", "arrays", "held", "key")
+
+    def __init__(self, roots: Iterable[Any]):
+        self.arrays, self.key, self.held = list[Any](), list[Hashable](), list[Any]()
+        self._numbers: dict[int, int] = {}
+        for root in roots:
+            self.add(root)
+
+    def add(self, value: Any) -> None:
+        """Add a value and all that it contains."""
+        kind = type(value)
+        visit = _VISITS.get(kind)
+        if visit is None:
+            visit = _VISITS[kind] = _find_visit(kind)
+        visit(self, value)
+
+    def is_new(self, value: Any) -> bool:
+        """Number ``value``, and return whether it was not numbered before."""
+        count = len(self._numbers)
+        number = self._numbers.setdefault(id(value), count)
+        self.key.append(number)
+        return number == count
+
+
+_VISITS: dict[type, Callable[[State, Any], None]] = {}
+
+
+def _find_visit(kind: type) -> Callable[[State, Any], None]:
+    """How values of the type ``kind`` are listed."""
+    if kind is float:
+        return _visit_float
+    if kind in (int, bool, str, bytes, type(None), complex, range) or issubclass(kind, (Enum, np.generic)):
+        return _visit_plain
+    if dr.is_array_v(kind):
+        return _visit_array
+    if issubclass(kind, (tuple, list)):
+        return _visit_sequence
+    if issubclass(kind, dict):
+        return _visit_mapping
+    if issubclass(kind, frozenset):
+        return _visit_plain
+    if issubclass(kind, np.ndarray):
+        return _visit_numpy
+    if issubclass(kind, nn.MatrixView):
+        return _visit_matrix
+    if kind is FunctionType:
+        return _visit_function
+    if issubclass(kind, (type, ModuleType, BuiltinFunctionType, MethodType)):
+        return _visit_identity
+    if kind.__dictoffset__:
+        return _visit_object
+    if any(base.__module__.partition(".")[0] == "mitsuba" for base in kind.__mro__):
+        return _refuse
+    return _visit_identity
+
+
+def _visit_plain(state: State, value: Any) -> None:
+    # 1 == True == 1.0, which are traced differently.
+    state.key += (type(value), value)
+
+
+def _visit_float(state: State, value: float) -> None:
+    # 0 == -0
+    state.key += (value, math.copysign(1.0, value))
+
+
+def _visit_array(state: State, value: Any) -> None:
+    if state.is_new(value):
+        state.arrays.append(value)
+
+
+def _visit_sequence(state: State, value: Sequence[Any]) -> None:
+    state.key += (type(value), len(value))
+    for item in value:
+        state.add(item)
+
+
+def _visit_mapping(state: State, value: dict[Any, Any]) -> None:
+    state.key += (dict, *value)
+    for item in value.values():
+        state.add(item)
+
+
+def _visit_numpy(state: State, value: np.ndarray) -> None:
+    if value.nbytes <= _MAX_COMPARED_BYTES and value.dtype != object:
+        state.key += (value.shape, value.dtype.str, value.tobytes())
+    else:
+        _visit_identity(state, value)
+
+
+def _visit_matrix(state: State, value: Any) -> None:
+    state.key += (value.dtype, value.layout, value.shape, value.offset, value.stride, value.transpose)
+    state.add(value.buffer)
+
+
+def _visit_function(state: State, value: Any) -> None:
+    _visit_identity(state, value)
+    for cell in value.__closure__ or ():
+        state.add(cell.cell_contents)
+
+
+def _visit_identity(state: State, value: Any) -> None:
+    state.key.append(id(value))
+    state.held.append(value)
+
+
+def _visit_object(state: State, value: Any) -> None:
+    if state.is_new(value):
+        kind, key = type(value), state.key
+        key.append(kind)
+        unrecorded = getattr(kind, "UNRECORDED", ())
+        for name, item in value.__dict__.items():
+            if name not in unrecorded:
+                key.append(name)
+                state.add(item)
+
+
+def _refuse(state: State, value: Any) -> None:
+    raise NotRecordable(f"an object of the type {type(value).__name__}")
+
+
+# ---- Objects of Mitsuba ----
+#
+# Dr.Jit lists the arrays of objects that are written in C++. Their other values belong to the key.
+
+_SENSORS = ("PerspectiveCamera", "ThinLensCamera", "OrthographicCamera", "Panorama")
+
+
+def _list_sensor(state: State, sensor: Any) -> None:
+    """Add the values of a ``sensor`` and its film that are not arrays."""
+    import mitsuba as mi
+
+    kind = type(sensor).__name__
+    kind = sensor.class_name() if kind in ("Sensor", "ProjectiveCamera") else kind
+    if kind not in _SENSORS:
+        raise NotRecordable(f"a sensor of the type {kind}")
+    if sensor.get_medium() is not None:
+        raise NotRecordable("a sensor inside a medium")
+    if isinstance(sensor, mi.ProjectiveCamera):
+        state.key += (sensor.near_clip(), sensor.far_clip())
+    film = sensor.film()
+    state.key += (kind, film.class_name(), str(film), str(film.rfilter()), film.flags())
+    state.key += (sensor.needs_aperture_sample(), sensor.shutter_open(), sensor.shutter_open_time())
+
+
+def _list_block(state: State, block: Any) -> None:
+    """Add the values of an image ``block`` that are not arrays."""
+    size, offset, rfilter = block.size(), block.offset(), block.rfilter()
+    state.key += (*size, *offset, block.border_size(), block.channel_count(), block.coalesce(), block.normalize())
+    state.key += (block.warn_negative(), block.warn_invalid(), None if rfilter is None else str(rfilter))
+
+
+# ---- Recordings ----
+
+_MAX_VARIANTS = 4
+"""Recordings of one key: Dr.Jit also distinguishes literals, and arrays of one element."""
+
+
+class _Recording:
+    """The recording of functions of one key."""
+
+    def __init__(self, held: list[Any]):
+        self.body: Callable[[], Any] | None = None
+        self._held = held
+        # The object is no pytree, so that Dr.Jit compares its identity.
+        current = self
+
+        def run(arrays: list[Any], natives: Sequence[Any]) -> Any:
+            assert current.body is not None
+            with gc_paused():
+                return current.body()
+
+        self._function: Any = dr.freeze(run, limit=_MAX_VARIANTS, warn_after=1 << 30)
+
+    @property
+    def count(self) -> int:
+        """How often the function was traced."""
+        return self._function.n_recordings
+
+    def __call__(self, body: Callable[[], Any], arrays: list[Any], natives: Sequence[Any]) -> Any:
+        self.body = body
+        try:
+            return self._function(arrays, natives)
+        except RuntimeError as error:
+            # Dr.Jit replaces the error of the function.
+            raise (error.__cause__ or error) from None
+        finally:
+            self.body = None
+
+
+_MAX_TRACED = 6
+"""How often a recording may be traced; behind that, its arrays change in a way that cannot be replayed."""
+
+
+class Recorder:
+    """Recordings of several functions and structures, the least recently used of which are dropped.
+
+    A function is traced as usual when its key is seen for the first time, so that single images cost nothing; it is
+    recorded the second time, and then replayed.
+    """
+
+    def __init__(self, max_recordings: int = 16):
+        self._max_recordings = max_recordings
+        self._recordings: dict[Hashable, _Recording | None] = {}
+        # Why the last function could not be recorded.
+        self.reason = ""
+
+    def run(
+        self,
+        body: Callable[[], Any],
+        key: Hashable,
+        list_inputs: Callable[[], Sequence[Any]],
+        numbers: Sequence[Any],
+        sensor: Any = None,
+        blocks: Sequence[Any] = (),
+    ) -> Any:
+        """Return ``body()``, a pytree of Dr.Jit arrays or None, or the same from a recording.
+
+        Parameters
+        ----------
+        key : Hashable
+            What ``body`` depends on besides the other arguments.
+        list_inputs : callable
+            Returns the objects that ``body`` reads.
+        numbers : sequence of arrays
+            Further arrays that it reads.
+        sensor : mi.Sensor, optional
+            A sensor that it reads.
+        blocks : sequence of mi.ImageBlock
+            Image blocks that it adds to.
+        """
+        try:
+            state = State(list_inputs())
+            if sensor is not None:
+                _list_sensor(state, sensor)
+            for block in blocks:
+                _list_block(state, block)
+        except NotRecordable as error:
+            self.reason = str(error)
+            return body()
+        arrays = [*numbers, *state.arrays]
+        if is_recording() or dr.grad_enabled(arrays):
+            return body()
+        full_key = key, dr.expand_threshold(), dr.thread_count(), tuple(state.key)
+        if full_key not in self._recordings:
+            self._store(full_key, None)
+            return body()
+        recording = self._recordings.pop(full_key) or _Recording(state.held)
+        self._store(full_key, recording)
+        if recording.count >= _MAX_TRACED:
+            return body()
+        return recording(body, arrays, [sensor, *blocks])
+
+    def _store(self, key: Hashable, recording: _Recording | None) -> None:
+        self._recordings[key] = recording
+        while len(self._recordings) > self._max_recordings:
+            del self._recordings[next(iter(self._recordings))]
+
+    def clear(self) -> None:
+        """Drop all recordings."""
+        self._recordings.clear()

@@ -1,0 +1,340 @@
+"""Replayed images, rays and points equal traced ones to the bit, whatever changes between two of them."""
+
+from __future__ import annotations
+
+import functools
+import sys
+from dataclasses import replace
+
+import drjit as dr
+import numpy as np
+import pytest
+
+import nerg_mi as nerg
+from nerg_mi.environment import bands
+from nerg_mi.errors import NergError
+from nerg_mi.fields.gaze_base import RaySupport
+from nerg_mi.fields.gaze_hits import HitKernel, ReaimedHits
+from nerg_mi.formats.fields import save_gaze
+from nerg_mi.registration import get_plugin_class
+from nerg_mi.transport.geometry import Ceiling
+from nerg_mi.transport.recording import Recorder
+from tests.plugins import fields
+from tests.plugins.scenes import camera, make_observer, put, scene_with, stored, with_field
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """A radiance field, a gaze field with support, and the same with re-aimed hits."""
+    folder, rng = tmp_path_factory.mktemp("recordings"), np.random.default_rng(5)
+    fields.radiance(folder / "field.safetensors")
+    gaze = fields.gaze(folder / "gaze.safetensors", normalized=True)
+    origins = rng.uniform(-0.5, 0.5, (400, 3)).astype(np.float32) + np.float32((0, 0, -2.5))
+    gaze.support = RaySupport.from_origins(origins, 0.5)
+    save_gaze(gaze, folder / "gaze.safetensors", {})
+    points = rng.uniform(-1, 1, (400, 3)).astype(np.float32)
+    gaze.hits = ReaimedHits(origins, points, [HitKernel(0.3, 0.2, 30.0), HitKernel(0.2, 0.5, 8.0)])
+    save_gaze(gaze, folder / "hits.safetensors", {})
+    return folder
+
+
+@pytest.fixture
+def count_traces(monkeypatch):
+    """A function that returns how often camera rays were traced."""
+    calls = []
+    trace = nerg_pixel().RenderContext.trace
+    monkeypatch.setattr(nerg_pixel().RenderContext, "trace", lambda *args: calls.append(0) or trace(*args))
+    return lambda: len(calls)
+
+
+def nerg_pixel():
+    """The module of the plugins of the current variant."""
+    return sys.modules[get_plugin_class("nerg").__module__ + "_pixel"]
+
+
+def make_scene(mi, files, gaze="hits", **overrides):
+    settings = {
+        "gaze": stored("gazefield", files / f"{gaze}.safetensors"),
+        "aovs": "depth,opacity,gaze,visibility,observer_depth,support,position",
+        "observer": make_observer(mi, -2, 0.3, -2),
+        "falloff": 2.0,
+        "map_height": 16,
+        "directions": 512,
+        "jitter": True,
+        **overrides,
+    }
+    sensor = camera(mi, size=9)
+    return scene_with(mi, with_field(files, **settings), sensor)
+
+
+def image(scene, sensor, spp, seed, layers=None):
+    (band,) = bands.render_bands(scene, sensor, spp=spp, seed=seed, layers=layers)
+    return np.array(band.film.develop())
+
+
+# ---- Changes of a scene between two images ----
+
+
+def move_camera(mi, scene, rng):
+    params = mi.traverse(scene)
+    position = rng.uniform(-0.5, 0.5, 3) + (0, 0, -2.5)
+    put(params, "sensor.to_world", mi.ScalarTransform4f().look_at(position.tolist(), [0, 0, 0], [0, 1, 0]))
+
+
+def change_lens(mi, scene, rng):
+    params = mi.traverse(scene)
+    params["sensor.x_fov"] = float(rng.uniform(30, 60))
+    params["sensor.principal_point_offset_x"] = float(rng.uniform(-0.1, 0.1))
+    params["sensor.near_clip"] = float(rng.uniform(0.01, 1.2))
+    params["sensor.far_clip"] = float(rng.uniform(2.5, 5))
+    params.update()
+
+
+def move_observer(mi, scene, rng):
+    x, y, z = rng.uniform(-0.5, 0.5, 3) + (-1.5, 0, -2)
+    to_world = mi.ScalarTransform4f().translate([x, y, z])
+    put(mi.traverse(scene), "integrator.observer.to_world", to_world)
+
+
+def move_observer_to_camera(mi, scene, rng):
+    """The image then needs no second march; if the observer is already there, they move away."""
+    params = mi.traverse(scene)
+    camera, observer = (params[f"{name}.to_world"] for name in ("sensor", "integrator.observer"))
+    if np.array_equal(np.array(camera.matrix), np.array(observer.matrix)):
+        move_observer(mi, scene, rng)
+    else:
+        put(params, "integrator.observer.to_world", type(camera)(camera))
+
+
+def change_falloff(mi, scene, rng):
+    put(mi.traverse(scene), "integrator.falloff", float(rng.uniform(1, 4)))
+
+
+def change_weights(mi, scene, rng):
+    params = mi.traverse(scene)
+    names = [key for key in params.keys() if key.startswith(("integrator.field.", "integrator.gaze."))]
+    name = names[rng.integers(len(names))]
+    put(params, name, params[name] * float(rng.uniform(0.8, 1.2)))
+
+
+def change_film(mi, scene, rng):
+    params = mi.traverse(scene)
+    width, height = (int(v) for v in rng.integers(6, 9, 2))
+    params["sensor.film.size"] = [9, 10]
+    params["sensor.film.crop_size"], params["sensor.film.crop_offset"] = [width, height], [1, int(rng.integers(2))]
+    params.update()
+
+
+def change_occlusion(mi, scene, rng):
+    scene.integrator().occlusion = not scene.integrator().occlusion
+
+
+def change_visibility(mi, scene, rng):
+    settings = scene.integrator().observer_settings
+    chosen = {"depth": "map", "map": "transmittance", "transmittance": "depth"}[settings.visibility]
+    scene.integrator().observer_settings = replace(settings, visibility=chosen)
+
+
+def change_tolerance(mi, scene, rng):
+    settings = scene.integrator().observer_settings
+    scene.integrator().observer_settings = replace(settings, tolerance=float(rng.uniform(0.01, 0.5)))
+
+
+def change_steps(mi, scene, rng):
+    scene.integrator().settings = replace(scene.integrator().settings, step=float(rng.uniform(0.05, 0.2)))
+
+
+def change_jitter(mi, scene, rng):
+    scene.integrator().jitter = not scene.integrator().jitter
+
+
+def change_ceiling(mi, scene, rng):
+    scene.integrator().ceiling = Ceiling(float(rng.uniform(-0.2, 0.2)), (0, 1, 0))
+
+
+def change_background(mi, scene, rng):
+    scene.integrator().background = mi.Spectrum(float(rng.uniform()))
+
+
+CHANGES = [
+    move_camera,
+    change_lens,
+    move_observer,
+    move_observer_to_camera,
+    change_falloff,
+    change_weights,
+    change_film,
+    change_occlusion,
+    change_visibility,
+    change_tolerance,
+    change_steps,
+    change_jitter,
+    change_ceiling,
+    change_background,
+]
+
+
+class Subject:
+    """A scene whose images are compared with traced ones."""
+
+    def __init__(self, mi, files, gaze):
+        self.mi, self.scene = mi, make_scene(mi, files, gaze)
+        self.integrator, self.sensor = self.scene.integrator(), self.scene.sensors()[0]
+        self.aovs, self.spp, self.seed = None, 1, 0
+
+    def render(self):
+        """The image, which must equal a traced one."""
+        layer = bands.AovLayer(self.integrator, self.sensor, self.aovs)
+        result = image(self.scene, self.sensor, self.spp, self.seed, layer)
+        context = self.integrator.context() if self.aovs is None else self.integrator.make_context(self.aovs, True)
+        traced = image(self.scene, self.sensor, self.spp, self.seed, TracedLayer(context, self.sensor))
+        assert np.array_equal(result, traced)
+        return result
+
+    def record(self):
+        """Render until images are replayed."""
+        for _ in range(3):
+            result = self.render()
+        return result
+
+
+@pytest.mark.parametrize("change", CHANGES, ids=lambda change: change.__name__)
+def test01_each_change_is_noticed(rgb, files, change):
+    subject, rng = Subject(rgb, files, "hits"), np.random.default_rng(3)
+    for _ in range(2):
+        # Only what was recorded before the change could be replayed by mistake.
+        subject.integrator.recorder.clear()
+        before = subject.record()
+        change(rgb, subject.scene, rng)
+        after = subject.record()
+        assert before.shape != after.shape or not np.array_equal(before, after)
+
+
+@pytest.mark.parametrize(
+    "changed", [{"spp": 2}, {"seed": 9}, {"aovs": ["gaze", "depth"]}, {"aovs": ["depth", "gaze"], "spp": 4}], ids=str
+)
+def test02_each_argument_is_noticed(rgb, files, changed):
+    subject = Subject(rgb, files, "gaze")
+    first = subject.record()
+    vars(subject).update(changed)
+    second = subject.record()
+    assert first.shape != second.shape or not np.array_equal(first, second)
+
+
+@pytest.mark.parametrize("gaze", ["gaze", "hits"])
+def test03_sequences_of_changes_are_noticed(rgb, files, gaze, count_traces):
+    """Images of earlier structures are replayed with what has changed since."""
+    subject, rng, before = Subject(rgb, files, gaze), np.random.default_rng(3), count_traces()
+    changes = [move_camera, move_observer, move_observer_to_camera, change_falloff, change_weights]
+    for _ in range(40):
+        changes[rng.integers(len(changes))](rgb, subject.scene, rng)
+        subject.seed = int(rng.integers(100))
+        subject.render()
+    # Each image is also traced for comparison.
+    assert 40 < count_traces() - before < 50
+
+
+class TracedLayer:
+    """The same image, without recordings and prepared observers."""
+
+    recorder = None
+
+    def __init__(self, context, sensor):
+        self.context, self.sensor = context, sensor
+        self.channel_names = [context.channel_names(context.aovs)]
+        self.num_channels = len(self.channel_names[0])
+
+    def sample(self, scene, sampler, ray, medium, active):
+        view = self.context.trace(scene, [self.sensor], sampler, ray, active)
+        channels = view.make_pixel().compute_channels(self.context.aovs)
+        radiance, shown, _ = view.compute_radiance(scene, sampler, medium)
+        return [(radiance, shown, channels)]
+
+
+def test04_image_equals_that_of_mitsuba(rgb, files, count_traces):
+    """The independent reference is ``mi.render``, which traces each image."""
+    scene, rng = make_scene(rgb, files), np.random.default_rng(4)
+    for seed in range(4):
+        move_camera(rgb, scene, rng)
+        move_observer(rgb, scene, rng)
+        before = count_traces()
+        replayed = image(scene, scene.sensors()[0], 2, seed)
+        assert (count_traces() > before) == (seed < 2)
+        assert np.array_equal(replayed, np.array(rgb.render(scene, spp=2, seed=seed)))
+
+
+# ---- Calls of the library ----
+
+
+def test05_pictures_of_several_observers_and_cameras(rgb, files, count_traces):
+    scene, rng = nerg.Scene(make_scene(rgb, files)), np.random.default_rng(6)
+    quantities = ["color", "depth", "gaze", "visibility"]
+    for number in range(5):
+        observers = rng.uniform(-0.5, 0.5, (2, 3)) + (0, 0, -2.5)
+        view = nerg.Camera(rng.uniform(-0.5, 0.5, 3) + (0, 0, -2.5), (0, 0, 0), fov=40 + number, width=8, height=6)
+        ask = functools.partial(nerg.render, scene, observers, quantities, camera=view, seed=number, spp=1)
+        before = count_traces()
+        replayed = ask()
+        assert (count_traces() > before) == (number == 0)
+        scene.integrator.recorder.clear()
+        expected = ask()
+        assert all(np.array_equal(replayed[name], expected[name]) for name in quantities), number
+        # Recorded again, for the next number.
+        ask()
+
+
+def test06_rays_and_points(rgb, files, count_traces):
+    scene, rng = nerg.Scene(make_scene(rgb, files)), np.random.default_rng(7)
+    for call in ("trace", "trace for origins", "observe"):
+        for number in range(4):
+            observers = (rng.uniform(-0.5, 0.5, (2, 3)) + (0, 0, -2.5)).astype(np.float32)
+            directions = rng.normal(size=(20, 3)) * 0.2 + (0, 0, 1)
+
+            def ask(call=call, observers=observers, directions=directions, seed=number):
+                if call == "observe":
+                    return nerg.observe(scene, directions * 0.5, observers)
+                names = ["color", "depth", "gaze", "visibility", "support"]
+                if call == "trace":
+                    return nerg.trace(scene, observers[0], directions, names, observers=observers, seed=seed)
+                return nerg.trace(scene, np.repeat(observers, 10, axis=0), directions, names, seed=seed)
+
+            replayed = ask()
+            scene.integrator.recorder.clear()
+            expected = ask()
+            assert all(np.array_equal(replayed[name], expected[name]) for name in expected.names), (call, number)
+            ask()
+            before = count_traces()
+            ask()
+            assert count_traces() == before
+
+
+# ---- What cannot be recorded ----
+
+
+def test07_scenes_that_cannot_be_recorded_are_traced(rgb, files, count_traces):
+    light = {"type": "sphere", "to_world": rgb.ScalarTransform4f().scale(0.2)}
+    for settings, reason in (({"shape": light}, "shapes"), ({}, "")):
+        scene = scene_with(rgb, with_field(files, aovs="depth"), camera(rgb, size=6), **settings)
+        for _ in range(4):
+            image(scene, scene.sensors()[0], 1, 0)
+        assert reason in scene.integrator().recorder.reason and bool(reason) == (count_traces() == 4)
+
+
+def test08_derivatives_are_traced(rgb, files, count_traces):
+    scene = scene_with(rgb, with_field(files, aovs="depth"), camera(rgb, size=6))
+    params = rgb.traverse(scene)
+    for _ in range(3):
+        image(scene, scene.sensors()[0], 1, 0)
+    dr.enable_grad(params["integrator.falloff"])
+    params.update()
+    before = count_traces()
+    image(scene, scene.sensors()[0], 1, 0)
+    assert count_traces() == before + 1
+
+
+def test09_errors_are_those_of_the_function(rgb):
+    recorder, number = Recorder(), rgb.Float([1, 2])
+    fail = lambda: (_ for _ in ()).throw(NergError("a test"))
+    for _ in range(3):
+        with pytest.raises(NergError, match="a test"):
+            recorder.run(fail, "fail", list, [number])
