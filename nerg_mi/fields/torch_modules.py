@@ -29,7 +29,7 @@ except ImportError:
     ) from None
 
 from nerg_mi.errors import NergError
-from nerg_mi.maths.arrays import to_vector
+from nerg_mi.maths.arrays import copy_aligned, to_vector
 
 from .gaze_base import GazeEnsemble, GazeNetwork
 from .mlp import is_cuda
@@ -362,7 +362,7 @@ def _evaluate_hits(field: GazeNetwork, p_o: torch.Tensor, r_o: torch.Tensor) -> 
     ns = field.ns
     directions, origins = (to_vector(ns.Array3f, v.detach().cpu().numpy()) for v in (r_o, p_o))
     observed = field.hits.observe(positions, ns)
-    density = observed.density(directions, origins, ns.UInt32(observer.ravel().astype(np.uint32)))
+    density = observed.density(directions, origins, ns.UInt32(copy_aligned(observer.ravel(), np.uint32)))
     return torch.as_tensor(np.array(density), device=p_o.device)
 
 

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from nerg_mi.environment.environment import DEFAULT_DEPTH, Environment
 from nerg_mi.errors import NergError, parameter
 from nerg_mi.fields.gaze_base import GazeHeadConfig, RaySupport
-from nerg_mi.maths.arrays import to_vector
+from nerg_mi.maths.arrays import copy_aligned, to_vector
 from nerg_mi.maths.geometry import AnyBox, intersect_box_numpy
 from nerg_mi.maths.sphere import fibonacci_directions, sort_directions
 from nerg_mi.maths.types import variant_types
@@ -82,7 +82,7 @@ def compute_semantic_features(
         for a in range(0, len(out), FEATURE_BATCH):
             part = slice(a, a + FEATURE_BATCH)
             o, d = to_vector(mi.Point3f, origins[part]), to_vector(mi.Vector3f, directions[part])
-            p = o + d * mi.Float(np.ascontiguousarray(distance[part], np.float32))
+            p = o + d * mi.Float(copy_aligned(distance[part]))
             features = features_for_observer(kind, scene, p, o, d, mi.Bool(True), march) or []
             # Evaluate all features in one kernel; separate evaluations would repeat the march or the network.
             dr.eval(features)
@@ -418,8 +418,8 @@ class TargetArrays:
         directions.
         """
         ns = self.ns
-        at = ns.UInt32(observers.astype(np.uint32))
-        index = ns.UInt32((observers[:, None] * self.num_directions + directions).astype(np.uint32).ravel())
+        at = ns.UInt32(copy_aligned(observers, np.uint32))
+        index = ns.UInt32(copy_aligned((observers[:, None] * self.num_directions + directions).ravel(), np.uint32))
         p_o, r_o = dr.gather(ns.Array3f, self._positions, at), dr.gather(ns.Array3f, self._r_o, index)
         p_od = dr.gather(ns.Array3f, self._positions, index // self.num_directions) + r_o * dr.gather(
             ns.Float, self._distance, index
@@ -428,14 +428,14 @@ class TargetArrays:
         if self._features:
             F = self._features
             semantic = [ns.Float(dr.gather(ns.Float16, self._semantic, index * F + k)) for k in range(F)]
-        full_sphere = np.full(len(observers), 4 * np.pi, np.float32)
+        solid_angle = np.full(len(observers), 4 * np.pi) if self._solid_angle is None else self._solid_angle[observers]
         return GazeBatch(
             p_o,
             r_o,
             p_od,
             dr.gather(ns.Float, self._truth, index),
             dr.gather(ns.Bool, self._misses, index),
-            ns.Float(full_sphere if self._solid_angle is None else self._solid_angle[observers]),
+            ns.Float(copy_aligned(solid_angle)),
             semantic,
             self._solid_angle is not None,
         )

@@ -10,7 +10,7 @@ import numpy as np
 
 from nerg_mi.fields.gaze_hits import ObservedHits
 from nerg_mi.fields.mlp import namespace
-from nerg_mi.maths.arrays import to_vector
+from nerg_mi.maths.arrays import copy_aligned, to_vector
 from nerg_mi.maths.sphere import fibonacci_directions_jit, morton_order
 from nerg_mi.maths.types import Bool, Float, Point3f, UInt32, Vector3f, variant_types
 
@@ -126,7 +126,9 @@ class _Block:
         for start in range(0, len(observer), RAYS_PER_LAUNCH):
             rows = slice(start, start + RAYS_PER_LAUNCH)
             index = observer[rows]
-            lanes = self._trace(mi.UInt32(index), to_vector(mi.Vector3f, directions[rows]), index)
+            lanes = self._trace(
+                mi.UInt32(copy_aligned(index, np.uint32)), to_vector(mi.Vector3f, directions[rows]), index
+            )
             values = [self._evaluate_member(k, lanes, index) for k in range(len(self._instance.field.members))]
             dr.eval(values)
             parts.append(np.stack([np.array(value) for value in values]))
@@ -139,7 +141,7 @@ class _Block:
         semantic = features_for_observer(
             field.config.semantic, self._geometry, lanes.p_od, lanes.p_o, lanes.r_o, active, march
         )
-        integral = None if self._integrals is None else mi.Float(self._integrals[number, observer].astype(np.float32))
+        integral = None if self._integrals is None else mi.Float(copy_aligned(self._integrals[number, observer]))
         gaze, *_ = field.members[number].evaluate(
             local.point_to_local(lanes.p_od),
             local.point_to_local(lanes.p_o),
@@ -154,7 +156,9 @@ class _Block:
         if self._hits is None or field.hits is None:
             return gaze
         position, direction = local.point_to_local(lanes.p_o), local.direction_to_local(lanes.r_o)
-        return field.hits.mix(gaze, self._hits.density(direction, position, mi.UInt32(observer)))
+        return field.hits.mix(
+            gaze, self._hits.density(direction, position, mi.UInt32(copy_aligned(observer, np.uint32)))
+        )
 
     def _integrate(self) -> np.ndarray:
         """Integrals (members, M) over the sphere."""
@@ -246,4 +250,8 @@ def _launches(observers: np.ndarray, count: int) -> Iterator[tuple[np.ndarray, U
         ray = dr.arange(mi.UInt32, len(index) * count)
         # Opaque, so that the numbers of directions share kernels.
         per_observer = dr.opaque(mi.UInt32, count)
-        yield index, dr.gather(mi.UInt32, mi.UInt32(index), ray // per_observer), ray % per_observer
+        yield (
+            index,
+            dr.gather(mi.UInt32, mi.UInt32(copy_aligned(index, np.uint32)), ray // per_observer),
+            ray % per_observer,
+        )

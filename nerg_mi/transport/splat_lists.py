@@ -16,6 +16,7 @@ from typing import Any, NamedTuple, cast
 import drjit as dr
 import numpy as np
 
+from nerg_mi.maths.arrays import copy_aligned
 from nerg_mi.maths.types import Bool, Float, UInt32, Vector3f
 
 from .jit import Fingerprint
@@ -82,9 +83,9 @@ class SplatLists(SplatHits):
                 ranks.append(members)
             # Numbers of all lists.
             self.size = ROW_SIZE * len(order) + int(starts[-1][-1])
-            self._starts = ns.UInt32(np.concatenate(starts).astype(np.uint32))
-            self._entries = ns.UInt32(np.concatenate([*ranks, np.zeros(1, np.int32)]).astype(np.uint32))
-            self._rows, self._indices = self._make_rows(ns.UInt32(order.astype(np.uint32)))
+            self._starts = ns.UInt32(copy_aligned(np.concatenate(starts), np.uint32))
+            self._entries = ns.UInt32(copy_aligned(np.concatenate([*ranks, np.zeros(1, np.int32)]), np.uint32))
+            self._rows, self._indices = self._make_rows(ns.UInt32(copy_aligned(order, np.uint32)))
         first = windows[0]
         self._axes = [ns.Array3f(*map(float, axis)) for axis in first.axes]
         self._lower = [ns.Float(float(v)) for v in first.lower]
@@ -125,7 +126,7 @@ class SplatLists(SplatHits):
         ns, (index,) = self._ns, np.nonzero(is_visible)
         if len(index) == 0:
             return index
-        i = ns.UInt32(index.astype(np.uint32)) * SHAPE_SIZE
+        i = ns.UInt32(copy_aligned(index, np.uint32)) * SHAPE_SIZE
         m = ns.Array3f(*(dr.gather(ns.Float, self.arrays.shapes, i + 9 + k) for k in range(3))) - self.center
         return index[np.argsort(dr.squared_norm(m).numpy(), kind="stable")]
 

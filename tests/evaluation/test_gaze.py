@@ -21,6 +21,7 @@ from nerg_mi.tracking.probes import place_probes
 from nerg_mi.tracking.rays import Rays
 from nerg_mi.train.gaze_folds import hold_out
 from tests.evaluation.gaze_fields import KINDS, made, saved
+from tests.kernels import list_kernels_each
 from tests.plugins import fields
 from tests.plugins.scenes import camera, channels
 from tests.refusals import mentions
@@ -444,6 +445,14 @@ def test05_a_field_with_surfaces_needs_geometry(rgb):
     without = made("default recipe", BOX, geometry="none", reach=1.5)
     d = fibonacci_directions(2048)
     assert FieldDensity(without, None)(np.array(EYES), d).mean() * 4 * np.pi == pytest.approx(1, abs=5e-3)
+
+
+@pytest.mark.parametrize("kind", ["default recipe", "re-aimed hits", "ensemble"])
+def test05_new_positions_need_no_new_kernels(rgb, places, kind):
+    density, rng = FieldDensity(made(kind, BOX), places["shapes"][0]), np.random.default_rng(0)
+    positions, directions = rng.uniform(*np.sort(EYES, axis=0), (10, 1, 3)), fibonacci_directions(8192)
+    kernels = list_kernels_each(lambda k: density(positions[k], directions), len(positions))
+    assert kernels[0] and set.union(*kernels[2:]) <= kernels[0] | kernels[1]
 
 
 def test06_semantic_features_are_those_of_the_render(rgb, places, tmp_path):

@@ -23,6 +23,7 @@ from nerg_mi.train.gaze_settings import GazeSettings
 from nerg_mi.train.gaze_trainer import GazeTrainer, Scores
 from nerg_mi.train.prior import compute_elevation_density, make_elevation_prior
 from nerg_mi.train.trainer import check_same_run
+from tests.kernels import list_kernels_each
 from tests.refusals import mentions
 
 from .looks import (
@@ -357,6 +358,14 @@ def test_the_result_is_the_average_of_the_weights(targets_trainer, average):
     for name, value in trainer.copy_weights().items():
         np.testing.assert_allclose(value.numpy(), expected[name], atol=1e-6)
     assert average == 0 or np.abs(expected["emit_head.0"] - trainer.optimiser["emit_head.0"].numpy()).max() > 1e-4
+
+
+def test_further_steps_need_no_new_kernels(targets_trainer):
+    """With indices of some kilobytes, which NumPy places at any multiple of 16 bytes."""
+    settings = GazeSettings(steps=24, learning_rate=1e-2, validation_zones=0)
+    trainer = ProductTrainer(targets_trainer, BOX, SMALL, settings, ns)
+    kernels = list_kernels_each(lambda _: trainer.step(), 24)
+    assert set.union(*kernels[4:]) <= set.union(*kernels[:4])
 
 
 # ---- The elevation prior for a scene without tracking, from other scenes ----
