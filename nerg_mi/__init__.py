@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from .environment.radiance import RadianceField
     from .environment.scene import Scene, make_scene
     from .environment.scene_file import write_scene
+    from .environment.tensors import render_tensor
     from .errors import NergError
     from .evaluation.folds import folds
     from .evaluation.held_out import evaluate_gaze
@@ -132,6 +133,7 @@ _MODULES = {
     "register_recipe": "nerg_mi.train.gaze_recipes",
     "render": "nerg_mi.figures.pictures",
     "render_film": "nerg_mi.figures.films",
+    "render_tensor": "nerg_mi.environment.tensors",
     "report": "nerg_mi.reports.report",
     "split_rays": "nerg_mi.tracking.splits",
     "statistics": "nerg_mi.aoi.statistics",
@@ -195,6 +197,7 @@ __all__ = [
     "register_recipe",
     "render",
     "render_film",
+    "render_tensor",
     "report",
     "split_rays",
     "statistics",

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure as Figure
     from mitsuba import Scene as MitsubaScene
     from mitsuba import Sensor as Sensor
+    from mitsuba import TensorXf as Tensor
 
     class Bool(ArrayBase["Bool", "Bool | bool", bool, bool, "Bool", "Bool", "Bool"]):
         """Mask; a Python bool is accepted."""
@@ -49,7 +50,7 @@ if TYPE_CHECKING:
         wavelengths: Any
 else:
     Bool = Float = UInt32 = Array3f = Ray3f = Any
-    Axes = Figure = MitsubaScene = Sensor = Any
+    Axes = Figure = MitsubaScene = Sensor = Tensor = Any
 
 Point3f: TypeAlias = Array3f  # Position, in the frame that the signature names
 

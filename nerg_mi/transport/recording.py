@@ -249,11 +249,11 @@ class Recorder:
     recorded the second time, and then replayed.
     """
 
-    def __init__(self, max_recordings: int = 16):
-        self._max_recordings = max_recordings
+    def __init__(self, is_enabled: bool = True, max_recordings: int = 16):
+        self.is_enabled, self._max_recordings = is_enabled, max_recordings
         self._recordings: dict[Hashable, _Recording | None] = {}
-        # Why the last function could not be recorded.
-        self.reason = ""
+        # Why the last function was not recorded; "" if it was. Reasons that were reported.
+        self.reason, self._reported = "", set[str]()
 
     def run(
         self,
@@ -280,6 +280,8 @@ class Recorder:
             Image blocks that it adds to.
         """
         try:
+            if not self.is_enabled:
+                raise NotRecordable("a recorder that is switched off, as it is on graphics cards")
             state = State(list_inputs())
             if sensor is not None:
                 _list_sensor(state, sensor)
@@ -290,6 +292,7 @@ class Recorder:
             return body()
         arrays = [*numbers, *state.arrays]
         if is_recording() or dr.grad_enabled(arrays):
+            self.reason = "derivatives or another recording"
             return body()
         full_key = key, dr.expand_threshold(), dr.thread_count(), tuple(state.key)
         if full_key not in self._recordings:
@@ -298,6 +301,7 @@ class Recorder:
         recording = self._recordings.pop(full_key) or _Recording(state.held)
         self._store(full_key, recording)
         if recording.count >= _MAX_TRACED:
+            self.reason = "arrays whose kind changes from image to image"
             return body()
         return recording(body, arrays, [sensor, *blocks])
 
@@ -305,6 +309,12 @@ class Recorder:
         self._recordings[key] = recording
         while len(self._recordings) > self._max_recordings:
             del self._recordings[next(iter(self._recordings))]
+
+    def take_reason(self) -> str:
+        """Why the last function was not recorded, the first time that this is asked; "" otherwise."""
+        reason = "" if self.reason in self._reported else self.reason
+        self._reported.add(self.reason)
+        return reason
 
     def clear(self) -> None:
         """Drop all recordings."""

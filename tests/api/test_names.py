@@ -80,7 +80,7 @@ def list_objects() -> dict[str, type]:
         if inspect.isclass(value):
             listed[name] = value
         elif not name.startswith("register_"):
-            kinds = set(re.findall(r"[A-Z]\w+", str(value.__annotations__["return"]))) - {"Figure", "Path"}
+            kinds = set(re.findall(r"[A-Z]\w+", str(value.__annotations__["return"]))) - {"Figure", "Path", "Tensor"}
             listed |= {kind: getattr(sys.modules[value.__module__], kind) for kind in kinds}
     return {name: kind for name, kind in listed.items() if not issubclass(kind, Exception)}
 

@@ -308,7 +308,28 @@ def test06_rays_and_points(rgb, files, count_traces):
             assert count_traces() == before
 
 
+def test10_tensors_equal_those_of_mitsuba(rgb, files, count_traces):
+    scene, rng, numbers = make_scene(rgb, files), np.random.default_rng(8), []
+    for seed in range(4):
+        move_camera(rgb, scene, rng)
+        change_weights(rgb, scene, rng)
+        before = count_traces()
+        replayed = nerg.render_tensor(scene, spp=2, seed=seed)
+        numbers.append(count_traces() - before)
+        assert np.array_equal(replayed, rgb.render(scene, spp=2, seed=seed))
+    assert numbers[0] == numbers[1] == 1 and numbers[3] == 0
+
+
 # ---- What cannot be recorded ----
+
+
+def test11_reason_is_told_once(rgb, files, recwarn):
+    shape = {"type": "sphere", "to_world": rgb.ScalarTransform4f().scale(0.2)}
+    scene = scene_with(rgb, with_field(files, aovs="depth"), camera(rgb, size=6), shape=shape)
+    for seed in range(2):
+        image = nerg.render_tensor(scene, seed=seed)
+        assert np.array_equal(image, rgb.render(scene, seed=seed))
+    assert ["shapes" in str(warning.message) for warning in recwarn] == [True]
 
 
 def test07_scenes_that_cannot_be_recorded_are_traced(rgb, files, count_traces):
