@@ -14,7 +14,7 @@ from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.maths.transforms import similarity_scale
 from nerg_mi.tracking.direction_checks import compute_hit_fractions, describe_mirroring
 from nerg_mi.tracking.rays import Rays
-from nerg_mi.transport.geometry import SceneGeometry, trace_depth
+from nerg_mi.transport.geometry import SURFACE_OPACITY, SceneGeometry, trace_depth
 from nerg_mi.transport.medium import Medium
 
 from .constraints import AlignmentFit
@@ -30,7 +30,6 @@ IMPOSSIBLE_ESCAPED = 0.98  # share of gaze without a surface above which the ali
 DOUBTFUL = {"escaped": 0.3, "inside": 0.1, "below": 0.1}
 """Shares above which the alignment is doubtful: gaze without a surface, heads inside solids, heads below the floor."""
 
-_SURFACE_OPACITY = 0.5
 # A head is inside a solid if this fraction of directions meets a surface within this distance in metres.
 _TIGHT_DISTANCE, _TIGHT_FRACTION, _NUM_DIRECTIONS = 0.06, 0.8, 16
 
@@ -78,18 +77,18 @@ def check_alignment(geometry: Medium | SceneGeometry, rays: Rays, align: Similar
         [rotation @ [[0, 0], [0, 0], [-1, 1]], fibonacci_directions(_NUM_DIRECTIONS).T], axis=1
     ).T
     depth, is_hit = trace_depth(geometry, np.repeat(heads, len(directions), 0), np.tile(directions, (len(heads), 1)))
-    depth, is_hit = depth.reshape(len(heads), -1), is_hit.reshape(len(heads), -1) >= _SURFACE_OPACITY
+    depth, is_hit = depth.reshape(len(heads), -1), is_hit.reshape(len(heads), -1) >= SURFACE_OPACITY
     tight_fraction = (is_hit & (depth < _TIGHT_DISTANCE * align.scale))[:, 2:].mean(axis=1)
     # A surface above and none below: the surface above is the floor.
     below = ~is_hit[:, 0] & is_hit[:, 1]
-    escaped = float((opacity < _SURFACE_OPACITY).mean())
+    escaped = float((opacity < SURFACE_OPACITY).mean())
     mirrored = None
     # Some gaze leaves through windows, so mirrored axes are tested only if the share is doubtful.
     if escaped > DOUBTFUL["escaped"]:
 
         def trace(origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
             depth, opacity = trace_depth(geometry, origins, directions)
-            return np.where(opacity >= _SURFACE_OPACITY, depth, np.inf)
+            return np.where(opacity >= SURFACE_OPACITY, depth, np.inf)
 
         mirrored = describe_mirroring(compute_hit_fractions(trace, origin, direction, rotation.T), len(origin))
     return AlignmentCheck(escaped, float((tight_fraction >= _TIGHT_FRACTION).mean()), float(below.mean()), mirrored)

@@ -20,7 +20,7 @@ from nerg_mi.maths.sphere import sample_uniform_directions
 from nerg_mi.maths.transforms import similarity_scale
 from nerg_mi.photos.posed import read_semidense
 from nerg_mi.tracking.readers.tables import iterate_table, read_table_columns
-from nerg_mi.transport.geometry import SceneGeometry, trace_depth
+from nerg_mi.transport.geometry import SURFACE_OPACITY, SceneGeometry, trace_depth
 from nerg_mi.transport.medium import Medium
 
 from .similarity import FULL_BASIS, LocalSimilarity, transform_points, vertical_rotation
@@ -156,7 +156,6 @@ def _sample_triangles(vertices: np.ndarray, faces: np.ndarray, count: int) -> np
 
 NUM_RAYS = 150_000  # number of rays that trace a scene
 NUM_VOXELS = 1 << 20  # approximate number of voxels
-_SURFACE_OPACITY = 0.5
 # Padding in voxels, and the volume of a pocket relative to the largest room.
 _PADDING, _MIN_ROOM_FRACTION = 3, 0.2
 
@@ -230,7 +229,7 @@ def trace_scene(
     start = rng.uniform(lower, upper, (num_rays, 3))
     direction = sample_uniform_directions(num_rays, rng)
     depth, opacity = trace_depth(geometry, start, direction)
-    is_hit = opacity >= _SURFACE_OPACITY
+    is_hit = opacity >= SURFACE_OPACITY
     if is_hit.mean() < 1e-3:
         raise NergError(
             "rays meet no surface in the scene, so nothing can be aligned with it; check the scene and its bounds"

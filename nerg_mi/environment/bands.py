@@ -20,6 +20,7 @@ from nerg_mi.fields.mlp import set_constant_weights
 from nerg_mi.fields.radiance import RadianceNetwork
 from nerg_mi.maths.types import variant_types
 from nerg_mi.transport.field_medium import FieldMedium
+from nerg_mi.transport.geometry import SURFACE_OPACITY
 from nerg_mi.transport.recording import Recorder
 
 if TYPE_CHECKING:
@@ -637,9 +638,6 @@ def _set_crop(film, size, offset) -> None:
 
 
 # ---- Channels of an image ----
-
-SURFACE_OPACITY = 0.5
-"""Opacity above which a pixel counts as a surface; the default of the integrator."""
 
 
 @dataclass(frozen=True, eq=False)

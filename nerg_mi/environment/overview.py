@@ -9,10 +9,9 @@ from functools import cached_property
 import numpy as np
 
 from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.transport.geometry import SURFACE_OPACITY
 
 Trace = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
-SURFACE_OPACITY = 0.5
-"""Minimum opacity of a surface hit."""
 
 _COARSE_SIZE, _FINE_SIZE = (18, 12), (48, 32)
 _NUM_CANDIDATES = 10

@@ -7,7 +7,6 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from nerg_mi.environment.bands import SURFACE_OPACITY
 from nerg_mi.environment.scene import Scene
 from nerg_mi.errors import NergError, parameter
 from nerg_mi.files.values import FilePath, find_names
@@ -17,7 +16,7 @@ from nerg_mi.ranges import COORDINATES, LENGTHS, Range, check_ranges
 from nerg_mi.tracking.dataset import open_rays
 from nerg_mi.tracking.filters import find_sessions, read_position_split
 from nerg_mi.tracking.rays import Rays
-from nerg_mi.transport.geometry import trace_depth
+from nerg_mi.transport.geometry import SURFACE_OPACITY, trace_depth
 
 from .maps import ParticipantPath, SightLines, Walls, floor_figure, floor_plan, layout_figure
 from .scene_views import list_files, open_scene

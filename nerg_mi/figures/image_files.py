@@ -8,7 +8,6 @@ from typing import Annotated, Any, cast
 
 import numpy as np
 
-from nerg_mi.environment.bands import SURFACE_OPACITY
 from nerg_mi.environment.scene_loading import activate_mitsuba
 from nerg_mi.errors import MissingFile, NergError, parameter
 from nerg_mi.files.images import read_exr, read_exr_attributes
@@ -17,6 +16,7 @@ from nerg_mi.maths.types import Figure
 from nerg_mi.photos.images import read_image
 from nerg_mi.progress import Progress, Reporter, open_reporter
 from nerg_mi.ranges import POSITIVE_VALUES, Range, check_ranges
+from nerg_mi.transport.geometry import SURFACE_OPACITY
 
 from .overlay import Overlay, OverlayLayers, difference_figure, find_channel_overlay, shared_limits, srgb
 from .settings import Style

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nerg_mi.environment.arrays import Camera, Floats, LabelledArrays, as_points, broadcast_to_observers
-from nerg_mi.environment.bands import SURFACE_OPACITY
 from nerg_mi.environment.queries import warn_extrapolation
 from nerg_mi.environment.scene import COLOR, Scene, make_aov_context, resolve_quantities
 from nerg_mi.environment.scene_loading import activate_mitsuba
@@ -20,6 +19,7 @@ from nerg_mi.files.values import FilePath
 from nerg_mi.maths.types import Axes, Figure, Sensor
 from nerg_mi.progress import Progress, Reporter, open_reporter
 from nerg_mi.ranges import SEEDS, SPP, Range, check_number
+from nerg_mi.transport.geometry import SURFACE_OPACITY
 from nerg_mi.transport.recording import Recorder
 
 from .style import show_figure

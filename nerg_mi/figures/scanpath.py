@@ -8,7 +8,6 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nerg_mi.environment.bands import SURFACE_OPACITY
 from nerg_mi.environment.scene import Scene
 from nerg_mi.environment.scene_writer import project_to_pixel
 from nerg_mi.errors import NergError, parameter
@@ -21,7 +20,7 @@ from nerg_mi.tracking.event_settings import EventRules
 from nerg_mi.tracking.events import average_fixations, label_fixations, warn_unknown_tracking
 from nerg_mi.tracking.measurement import warn_slow_sampling
 from nerg_mi.tracking.rays import Rays
-from nerg_mi.transport.geometry import trace_depth
+from nerg_mi.transport.geometry import SURFACE_OPACITY, trace_depth
 from nerg_mi.transport.observer import sensor_center
 
 from .floor_plans import select_participants
