@@ -506,9 +506,10 @@ class NergIntegrator(mi.SamplingIntegrator):
         self.aovs = nerg_aovs.parse_aovs(read_string(props, "aovs", "depth,opacity"), self)
         self.required_data = nerg_aovs.collect_required_data(self.aovs)
         self.views = nerg_aovs.collect_observer_views(self.aovs, self)
-        self.cache, self.variant = ObserverCache(), mi.variant()
+        self.variant = mi.variant()
         # Not tested on graphics cards.
         self.recorder = Recorder(is_enabled=str(self.variant).startswith("llvm"))
+        self.cache = ObserverCache(recorder=self.recorder)
         self._sensors = None  # sensor of the current rendering; None if another integrator calls this one
 
     def aov_names(self):

@@ -17,6 +17,7 @@ from nerg_mi.maths.types import Float, Point3f, Ray3f, Vector3f, variant_types
 from .geometry import SceneGeometry
 from .jit import Fingerprint, fingerprint_shapes, is_recording
 from .march_primal import MarchSettings
+from .recording import Recorder
 from .splat_lists import CELL_PIXELS, Window
 
 if TYPE_CHECKING:
@@ -63,10 +64,12 @@ class ObserverCache:
     """The cache of one integrator, or of a caller that evaluates gaze for several observers in turn.
 
     For each key the entries of the most recent observers are kept; scalars are kept for many more observers, in
-    ``scalar_cache`` if given: a cache that outlives this one.
+    ``scalar_cache`` if given: a cache that outlives this one. ``recorder``: recordings of what is computed for
+    observers; default: those of the ``scalar_cache``, or none.
     """
 
-    def __init__(self, scalar_cache: ObserverCache | None = None) -> None:
+    def __init__(self, scalar_cache: ObserverCache | None = None, recorder: Recorder | None = None) -> None:
+        self.recorder = scalar_cache.recorder if recorder is None and scalar_cache is not None else recorder
         self._slots: dict[Hashable, _CacheSlot] = {}
         self._values: dict[Hashable, tuple[Any, Any]] = {}
         self._numbers = scalar_cache or self

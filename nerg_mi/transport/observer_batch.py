@@ -212,7 +212,7 @@ class _Block:
             distance, escaped = tracer.trace_distances(directions)
         else:
             assert index is not None
-            has_surface, distance = tracer.trace_surfaces(directions, tracer.miss_distance(directions))
+            has_surface, distance = tracer.trace_surfaces(directions, ends_at_box=True)
             dr.eval(has_surface, distance)
             depth, missed, vectors = np.array(distance), ~np.array(has_surface), np.array(directions).T
             starts = np.flatnonzero(np.diff(index, prepend=-1))
@@ -227,7 +227,7 @@ class _Block:
         vectors = np.array(fibonacci_directions_jit(MISS_DIRECTIONS)).T
         for index, observer, direction in _launches(np.arange(self._count), MISS_DIRECTIONS):
             directions, tracer = fibonacci_directions_jit(MISS_DIRECTIONS, direction), self._tracer(observer)
-            has_surface, distance = tracer.trace_surfaces(directions, tracer.miss_distance(directions))
+            has_surface, distance = tracer.trace_surfaces(directions, ends_at_box=True)
             dr.eval(has_surface, distance)
             shape = len(index), MISS_DIRECTIONS
             for mask, depth in zip(np.array(has_surface).reshape(shape), np.array(distance).reshape(shape)):

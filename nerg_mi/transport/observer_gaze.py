@@ -21,10 +21,13 @@ from nerg_mi.maths.geometry import Similarity, intersect_box
 from nerg_mi.maths.sphere import fibonacci_directions_jit, morton_order
 from nerg_mi.maths.types import Bool, Float, Point3f, Vector3f, variant_types
 
-from .field_medium import features_for_observer
+from .depth import DEPTHS
+from .field_medium import FieldMedium, features_for_observer
 from .geometry import SceneGeometry
 from .jit import Fingerprint, is_recording
 from .observer import CacheEntry, ObserverCache, ObserverSettings, fingerprint_geometry, select_nearest
+from .quadrature import RULES
+from .recording import Recorder
 
 # ---- Integral over an observer's sphere, with an error estimate ----
 #
@@ -171,6 +174,7 @@ class ObserverTracer:
     geometry: SceneGeometry
     center: Point3f
     settings: ObserverSettings
+    recorder: Recorder | None = None
 
     def trace(self, count: int | None = None, miss_depths: MissDepths | None = None) -> SphereSamples:
         """Sphere samples in ``count`` directions (default: ``settings.directions``); ``miss_depths``: see
@@ -194,7 +198,7 @@ class ObserverTracer:
         width = dr.width(directions)
         if not self.placed.field.config.needs_surfaces:
             return dr.ones(mi.Float, width), dr.full(mi.Bool, False, width)
-        has_surface, depth = self.trace_surfaces(directions, self.miss_distance(directions))
+        has_surface, depth = self.trace_surfaces(directions, ends_at_box=True)
         if self.placed.field.config.fills_escaped:
             escaped = ~np.array(has_surface)
             if escaped.any():
@@ -208,21 +212,31 @@ class ObserverTracer:
         """Trace the depths for rays that escape."""
         directions = fibonacci_directions_jit(MISS_DIRECTIONS)
         with dr.suspend_grad():
-            results = self.trace_surfaces(directions, self.miss_distance(directions))
+            results = self.trace_surfaces(directions, ends_at_box=True)
         has_surface, distance = (np.array(v) for v in results)
         return MissDepths(np.array(directions).T[has_surface], distance[has_surface])
 
-    def trace_surfaces(self, directions: Vector3f, miss_distance: Float | float = 0.0) -> tuple[Bool, Float]:
-        """Whether there is a surface along unit ``directions``, and its distance in scene units; ``miss_distance``
-        without one."""
-        mi, settings = variant_types(), self.settings
-        all_lanes = dr.full(mi.Bool, True, dr.width(directions))
-        seen = self.geometry.seen_from(self.center, dr.width(directions))
-        ray_hit = seen.trace(mi.Ray3f(self.center, directions), all_lanes, settings.march)
-        has_surface = all_lanes & ray_hit.has_surface(settings.surface_opacity)
-        return has_surface, cast(
-            "Float", dr.select(has_surface, ray_hit.depth(settings.depth, has_surface), miss_distance)
-        )
+    def trace_surfaces(self, directions: Vector3f, ends_at_box: bool = False) -> tuple[Bool, Float]:
+        """Whether there is a surface along unit ``directions``, and its distance in scene units; without one
+        `miss_distance` if ``ends_at_box``, else 0."""
+
+        def trace() -> tuple[Bool, Float]:
+            mi, settings = variant_types(), self.settings
+            all_lanes = dr.full(mi.Bool, True, dr.width(directions))
+            seen = self.geometry.seen_from(self.center, dr.width(directions))
+            ray_hit = seen.trace(mi.Ray3f(self.center, directions), all_lanes, settings.march)
+            has_surface = all_lanes & ray_hit.has_surface(settings.surface_opacity)
+            end = self.miss_distance(directions) if ends_at_box else 0
+            depth = dr.select(has_surface, ray_hit.depth(settings.depth, has_surface), end)
+            return has_surface, cast("Float", depth)
+
+        if self.recorder is None or not is_field(self.geometry):
+            return trace()
+        rules = [RULES.find(self.settings.march.quadrature), DEPTHS.find(self.settings.depth)]
+        frame = [self.placed.field.box, self.placed.to_world]
+        list_inputs = lambda: [self.geometry, self.center, self.settings, *rules, *frame]
+        key = "surfaces", dr.width(directions), ends_at_box
+        return self.recorder.run(trace, key, list_inputs, [directions])
 
     def miss_distance(self, directions: Vector3f) -> Float:
         """End of a ray without a surface: on the bounding box of the gaze field, or at a distance of its diagonal."""
@@ -308,7 +322,7 @@ class GazeFieldInstance:
         made_of = (*made_of, settings.directions, settings.integral_tolerance)
         integrals = []
         for member in self.field.members:
-            integral = _SphereIntegral(self, member, geometry, settings)
+            integral = _SphereIntegral(self, member, geometry, settings, cache.recorder)
             parameters = list(member.parameters().values())
             if dr.grad_enabled(parameters):
                 entries = [CacheEntry(k.center, integral.attached(k)) for k in samples]
@@ -357,6 +371,7 @@ class _SphereIntegral:
     member: GazeHead
     geometry: SceneGeometry
     settings: ObserverSettings
+    recorder: Recorder | None = None
 
     def detached(self, entry: CacheEntry) -> Float:
         """The value of the integral (one lane)."""
@@ -407,9 +422,19 @@ class _SphereIntegral:
         return integrate_sphere(eval_in_order, self.settings.directions, self.settings.integral_tolerance)
 
     def _around(self, entry: CacheEntry, count: int) -> SphereSamples:
-        return entry.value.get(count, ObserverTracer(self.placed, self.geometry, entry.center, self.settings))
+        tracer = ObserverTracer(self.placed, self.geometry, entry.center, self.settings, self.recorder)
+        return entry.value.get(count, tracer)
 
     def _integrand(self, entry: CacheEntry, samples: SphereSamples) -> Float:
+        has_constants = any(net.has_constant_weights for net in self.member.mlps)
+        if self.recorder is None or has_constants or not is_field(self.geometry):
+            return self._evaluate_integrand(entry, samples)
+        list_inputs = lambda: [self.placed, self.member]
+        key, arrays = ("integrand", dr.width(samples.directions)), [entry.center, samples.directions]
+        arrays += [samples.distance, samples.escaped]
+        return self.recorder.run(lambda: self._evaluate_integrand(entry, samples), key, list_inputs, arrays)
+
+    def _evaluate_integrand(self, entry: CacheEntry, samples: SphereSamples) -> Float:
         o = entry.center + dr.zeros(type(entry.center), dr.width(samples.directions))
         emit, capture = self.placed.unnormalized(
             self.member, o + samples.directions * samples.distance, o, samples.directions, True, samples.escaped
@@ -586,6 +611,14 @@ class ObservedGaze:
     @cached_property
     def _merged_hits(self) -> ObservedHits:
         return ObservedHits.merge([entry.value for entry in self._hits])
+
+
+def is_field(geometry: SceneGeometry) -> bool:
+    """Whether ``geometry`` is a radiance field alone, without constant weights: what can be recorded."""
+    medium = geometry.medium
+    if geometry.scene is not None or not isinstance(medium, FieldMedium):
+        return False
+    return not any(net.has_constant_weights for net in medium.field.mlps)
 
 
 # ---- Gaze of one observer in arbitrary directions ----

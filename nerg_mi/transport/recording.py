@@ -291,7 +291,9 @@ class Recorder:
             self.reason = str(error)
             return body()
         arrays = [*numbers, *state.arrays]
-        if is_recording() or dr.grad_enabled(arrays):
+        with dr.resume_grad():
+            has_gradients = dr.grad_enabled(arrays)
+        if is_recording() or has_gradients:
             self.reason = "derivatives or another recording"
             return body()
         full_key = key, dr.expand_threshold(), dr.thread_count(), tuple(state.key)
