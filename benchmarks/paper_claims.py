@@ -105,8 +105,10 @@ def less(rows: list[dict], recipe: str, variant: str, key: str) -> list[float]:
 
 
 def print_row(values: list[float]) -> str:
-    """Mean of ``values`` with its interval; empty without values."""
-    return f"{np.mean(values):+.3f} ± {interval(values):.3f}" if values else ""
+    """Mean of ``values`` with its interval, which needs two of them; empty without values."""
+    if not values:
+        return ""
+    return f"{np.mean(values):+.3f} ± {interval(values):.3f}" if len(values) > 1 else f"{values[0]:+.3f}"
 
 
 if __name__ == "__main__":
