@@ -16,7 +16,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
 from hashlib import sha256
 from importlib import import_module
 from itertools import product
@@ -73,10 +73,18 @@ def make_tests(rays, args: argparse.Namespace) -> tuple:
     return train, tests
 
 
+def describe(value: object) -> object:
+    """What determines a training, of a recipe: without functions, whose addresses differ between processes."""
+    if is_dataclass(value):
+        values = {f.name: getattr(value, f.name) for f in fields(value)}
+        return {name: v for name, v in values.items() if not callable(v)}
+    return sorted(value) if isinstance(value, frozenset) else str(value)
+
+
 def train_variant(rays, tests: dict, file: Path, settings: dict) -> dict:
     """Scores and seconds of a training with ``settings``, whose checkpoint is ``file``; stored next to it."""
     path, digests = file.with_suffix(".json"), {k: sha256(t.truth.tobytes()).hexdigest() for k, t in tests.items()}
-    same = json.loads(json.dumps({**settings, "rays": digest_rays(rays), "tests": digests}, default=str))
+    same = json.loads(json.dumps({**settings, "rays": digest_rays(rays), "tests": digests}, default=describe))
     stored = json.loads(path.read_text()) if path.is_file() and file.is_file() else {}
     if stored.get("same") != same:
         started = time.perf_counter()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 
 import numpy as np
@@ -40,6 +41,15 @@ def test_variants_are_those_that_the_recipe_supports(ablation):
     frozen = variants["begins as the field, frozen"]["recipe"]
     assert frozen.options.init_from_field and frozen.settings.freeze
     assert not {"semantic snapshot", "begins as the field"} & set(ablation.list_variants(paper, False))
+
+
+def test_recipes_have_the_same_description_in_each_process(ablation):
+    recipe = get_recipe("paper")
+    text = json.dumps(recipe, default=ablation.describe)
+    assert " at 0x" in str(recipe) and " at 0x" not in text
+    described = json.loads(text)
+    assert described["name"] == "paper" and described["settings"]["steps"] == recipe.settings.steps
+    assert described["options"] != json.loads(json.dumps(get_recipe("default"), default=ablation.describe))["settings"]
 
 
 def test_variants_are_trained_once_and_compared(ablation, tmp_path, monkeypatch):
