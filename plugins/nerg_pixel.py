@@ -23,7 +23,7 @@ from nerg_mi.transport.jit import is_recording
 from nerg_mi.transport.march_primal import MarchResult
 from nerg_mi.transport.medium import SampleShader
 from nerg_mi.transport.observer import CacheEntry, ObserverCache, ObserverView, observe_view, select_nearest
-from nerg_mi.transport.observer_gaze import GazeFieldInstance, ObservedGaze
+from nerg_mi.transport.observer_gaze import GazeFieldInstance, ObservedGaze, has_listed_networks
 from nerg_mi.transport.occlusion import ObserverHit, ObserverMap, get_observer_map, trace_from_observer
 from nerg_mi.transport.quadrature import RULES
 from nerg_mi.transport.recording import NotRecordable
@@ -112,8 +112,8 @@ class RenderContext:
             raise NotRecordable(f"a {type(nerg.medium).__name__}")
         trained = [nerg.medium.field] if nerg.medium is not None else []
         trained += [] if nerg.gaze is None else [nerg.gaze.field]
-        if any(net.has_constant_weights for field in trained for net in field.mlps):
-            raise NotRecordable("constant weights")
+        if not all(map(has_listed_networks, trained)):
+            raise NotRecordable("constant weights, or networks that a field does not list")
         rules = [RULES.find(nerg.settings.quadrature), DEPTHS.find(nerg.observer_settings.depth)]
         return [self, nerg.hide_emitters, rules, [nerg_aovs.AOVS[name].compute for name in self.aovs]]
 

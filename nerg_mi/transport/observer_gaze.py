@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import cast
+from typing import Any, cast
 
 import drjit as dr
 import numpy as np
@@ -426,8 +426,7 @@ class _SphereIntegral:
         return entry.value.get(count, tracer)
 
     def _integrand(self, entry: CacheEntry, samples: SphereSamples) -> Float:
-        has_constants = any(net.has_constant_weights for net in self.member.mlps)
-        if self.recorder is None or has_constants or not is_field(self.geometry):
+        if self.recorder is None or not has_listed_networks(self.member) or not is_field(self.geometry):
             return self._evaluate_integrand(entry, samples)
         list_inputs = lambda: [self.placed, self.member]
         key, arrays = ("integrand", dr.width(samples.directions)), [entry.center, samples.directions]
@@ -613,12 +612,19 @@ class ObservedGaze:
         return ObservedHits.merge([entry.value for entry in self._hits])
 
 
+def has_listed_networks(field: Any) -> bool:
+    """Whether a recording knows what ``field`` reads: it lists its networks, whose weights are no constants.
+
+    Registered fields of other packages need not list theirs, and may read what is no attribute.
+    """
+    networks = getattr(field, "mlps", None)
+    return networks is not None and not any(net.has_constant_weights for net in networks)
+
+
 def is_field(geometry: SceneGeometry) -> bool:
-    """Whether ``geometry`` is a radiance field alone, without constant weights: what can be recorded."""
+    """Whether ``geometry`` is a radiance field alone that can be recorded."""
     medium = geometry.medium
-    if geometry.scene is not None or not isinstance(medium, FieldMedium):
-        return False
-    return not any(net.has_constant_weights for net in medium.field.mlps)
+    return geometry.scene is None and isinstance(medium, FieldMedium) and has_listed_networks(medium.field)
 
 
 # ---- Gaze of one observer in arbitrary directions ----

@@ -151,19 +151,19 @@ def _read_radiance_run(folder: Path) -> object:
 
 
 def _make_gaze_run(folder: Path) -> None:
+    from nerg_mi.train.gaze_product import ProductTrainer
     from nerg_mi.train.gaze_run import GazeFit, GazeRunFile
-    from nerg_mi.train.trainer import Trainer
 
-    trainer, fit = _trainer(Trainer), GazeFit(best_step=2, schedule=5)
+    trainer, fit = _trainer(ProductTrainer), GazeFit(best_step=2, schedule=5)
     GazeRunFile(folder / "gaze.run", _METADATA).save("fit", trainer, fit.to_dict(), trainer.averaged, force=True)
 
 
 def _read_gaze_run(folder: Path) -> object:
+    from nerg_mi.train.gaze_product import ProductTrainer
     from nerg_mi.train.gaze_run import GazeRunFile
-    from nerg_mi.train.trainer import Trainer
 
     file = GazeRunFile(folder / "gaze.run", _METADATA, resume=True)
-    return file.restore("fit", _trainer(Trainer))
+    return file.restore("fit", _trainer(ProductTrainer))
 
 
 # --- torch ------------------------------------------------------------------------------------------------------------
