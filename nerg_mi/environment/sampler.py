@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import drjit as dr
 import numpy as np
 
 from nerg_mi.fields.gaze_base import GazeNetwork
@@ -61,8 +60,6 @@ class GazeSampler:
         """Return the gaze density (N,) of ``observer`` (3,) in unit ``directions`` (N, 3), in 1/sr."""
         mi = variant_types()
         center = mi.Point3f(*np.asarray(observer, float).tolist())
-        # A literal position would compile new kernels for each observer.
-        dr.make_opaque(center)
         observed = self.gaze.for_observers([center], self.geometry, self.settings)
         return np.array(observed.evaluate_along(center, to_vector(mi.Vector3f, directions)))
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
-import drjit as dr
 import numpy as np
 
 from nerg_mi.errors import NergError, parameter
@@ -145,8 +144,6 @@ class FieldDensity:
         """Evaluate the densities (M, D) of one observer (3,), both in the frame of the field."""
         mi = variant_types()
         p_o, key = mi.Point3f(*position.tolist()), position.tobytes()
-        # A literal position would compile new kernels for each observer.
-        dr.make_opaque(p_o)
         new = key not in self._observed
         if new:
             self._observed[key] = self._gaze.for_observers([p_o], self._environment, self._settings)
