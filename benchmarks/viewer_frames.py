@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import io
-import tempfile
 import threading
 import time
 from collections import Counter
@@ -58,7 +57,7 @@ class Listener:
         raise error
 
 
-def measure(scene: Path, width: int, seconds: float, compile: bool, folder: Path) -> list[list[str]]:
+def measure(scene: Path, width: int, seconds: float, compile: bool) -> list[list[str]]:
     """Rows of the table: a moving camera, and a moving observer."""
     from nerg_mi.viewer.page import REST_SECONDS, BrowserWindow, Page
     from nerg_mi.viewer.points import PinholeView
@@ -66,7 +65,7 @@ def measure(scene: Path, width: int, seconds: float, compile: bool, folder: Path
     from nerg_mi.viewer.source import open_viewer_scene
 
     settings = SessionSettings(width=width, compile=compile)
-    session = Session(lambda: open_viewer_scene(scene, folder), settings, Listener())
+    session = Session(lambda: open_viewer_scene(scene), settings, Listener())
     session.start()
     try:
         while compile and session.compiled is None:
@@ -121,9 +120,8 @@ def main(argv=None) -> None:
     parser.add_argument("--seconds", type=float, default=4, help="length of a movement (default: 4)")
     args = parser.parse_args(argv)
     rows = []
-    with tempfile.TemporaryDirectory() as folder:
-        for compile in (True, False):
-            rows += measure(args.scene, args.width, args.seconds, compile, Path(folder))
+    for compile in (True, False):
+        rows += measure(args.scene, args.width, args.seconds, compile)
     save_result("viewer", ("density", "moving", "usual size", "images a second", "full resolution, s"), rows)
 
 

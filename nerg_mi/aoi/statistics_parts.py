@@ -313,5 +313,4 @@ def _geometry_files(gaze: Path) -> list[Path]:
     field = GazeField.open(gaze)
     if field.provenance.get("geometry") == "none":
         return []
-    path = field.find_environment_file()
-    return list_scene_files(path) if path.suffix.lower() == ".xml" else [path]
+    return list_scene_files(field.find_environment_file())

@@ -186,29 +186,32 @@ class FieldVolume:
             return choose_plugin(self.field)
         return "splats" if isinstance(self.field, Splats) else "nerf"
 
+    @property
+    def path(self) -> Path | None:
+        """The file of the field."""
+        if isinstance(self.field, TrainedField):
+            return self.field.path
+        return Path(self.field) if isinstance(self.field, (str, os.PathLike)) else None
+
     def load(self) -> Any:
         """Return the volume in memory."""
         if isinstance(self.field, (str, os.PathLike)):
-            return self._describe(Path(self.field))
+            return self.describe(Path(self.field))
         volume = get_plugin_class(self.plugin)
         if isinstance(self.field, Splats):
             return volume.from_network(self.field, self.to_world)
         return volume.from_network(self.field.network, self.to_world, self.field.name)
 
     def place(self, path: Path) -> dict[str, Any]:
-        """Write the field to ``path``, unless it is a file, and return the volume as a dict."""
-        field = self.field
-        if isinstance(field, TrainedField) and field.path is not None:
-            field = field.path
-        if isinstance(field, (str, os.PathLike)):
-            return self._describe(Path(field))
-        if isinstance(field, Splats):
-            write_ply_splats(path, field)
+        """Write the field to ``path``, and return the volume as a dict."""
+        if isinstance(self.field, Splats):
+            write_ply_splats(path, self.field)
         else:
-            field.save(path)
-        return self._describe(path)
+            self.field.save(path)
+        return self.describe(path)
 
-    def _describe(self, path: Path) -> dict[str, Any]:
+    def describe(self, path: Path) -> dict[str, Any]:
+        """Return the volume of the file ``path`` as a dict."""
         world = {} if self.to_world is None else {"to_world": self.to_world}
         return {"type": self.plugin, "filename": os.path.abspath(path), **world}
 
@@ -504,16 +507,26 @@ def write_content(path: Path, content: Mapping[str, Any], comment: str) -> list[
         An object of Mitsuba cannot be written, or a file cannot be written.
     """
     writer = _ContentWriter(path)
-    nodes = [writer.make_node(name, value, is_top=True) for name, value in content.items() if name != "type"]
-    write_text(path, format_document(nodes, comment))
+    write_text(path, format_document(writer.make_nodes(content), comment))
     return [path, *writer.written]
 
 
-class _ContentWriter:
-    """Makes elements of a scene file, and writes what they refer to."""
+def format_content(content: Mapping[str, Any]) -> str:
+    """Return the text of a scene file with the content of a scene and absolute file names.
 
-    def __init__(self, path: Path) -> None:
+    Raises `NergError` if a part of it has no file.
+    """
+    return format_document(_ContentWriter(None).make_nodes(content), "")
+
+
+class _ContentWriter:
+    """Makes elements of a scene file, and writes what they refer to; without a ``path`` nothing is written."""
+
+    def __init__(self, path: Path | None) -> None:
         self.path, self.written = path, []
+
+    def make_nodes(self, content: Mapping[str, Any]) -> list[Node]:
+        return [self.make_node(name, value, is_top=True) for name, value in content.items() if name != "type"]
 
     def make_node(self, name: str, value: Any, is_top: bool = False) -> Node:
         from nerg_mi.transport.mitsuba_mesh import is_mesh, write_ply
@@ -523,13 +536,13 @@ class _ContentWriter:
             write_mesh(file, with_shading_normals(value))
             self.written.append(file)
             return self._make_plugin(name, {"type": "ply", "filename": str(file), "bsdf": _bsdf(value)}, is_top)
+        if isinstance(value, FieldVolume) and (file := value.path) is not None:
+            return self._make_plugin(name, value.describe(file), is_top)
         if isinstance(value, (FieldVolume, GridVolume)):
             suffix = ".vol" if isinstance(value, GridVolume) else ".ply" if value.plugin == "splats" else ".safetensors"
             file = self._file(name, suffix)
-            description = value.place(file)
-            if file == Path(description["filename"]):
-                self.written.append(file)
-            return self._make_plugin(name, description, is_top)
+            self.written.append(file)
+            return self._make_plugin(name, value.place(file), is_top)
         if isinstance(value, Mapping):
             return self._make_plugin(name, value, is_top)
         if is_mesh(value):
@@ -544,6 +557,8 @@ class _ContentWriter:
 
     def _file(self, name: str, suffix: str, is_mesh: bool = False) -> Path:
         safe = make_portable_name("".join(c if c.isalnum() or c in "-_" else "_" for c in name))
+        if self.path is None:
+            raise NergError(f'"{name}" of the scene has no file; write the scene and its objects by its method save')
         stem = self.path.absolute().with_suffix("")
         # A scene may have hundreds of meshes.
         prefix = make_folder(f"{stem}.meshes") / safe if is_mesh else Path(f"{stem}.{safe}")
@@ -579,7 +594,7 @@ class _ContentWriter:
         if isinstance(value, (str, os.PathLike)):
             text = os.fspath(value)
             if name == "filename":
-                text = relative_path(Path(text), self.path.parent)
+                text = relative_path(Path(text), None if self.path is None else self.path.parent)
             return prop("string", name, check_attribute(text))
         if hasattr(value, "matrix"):
             return transform(matrix(np.array(value.matrix, float).reshape(4, 4)), name=name)

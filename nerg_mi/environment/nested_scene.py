@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from copy import deepcopy
+from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
@@ -119,19 +120,8 @@ def resolve_defaults(children: list[ElementTree.Element]) -> dict[str, str]:
     return values
 
 
-def make_paths_absolute(elements: list[ElementTree.Element], path: Path, children: list[ElementTree.Element]) -> None:
-    """Make file names in ``elements`` and their `<default>`s absolute, in place.
-
-    Parameters
-    ----------
-    elements : list of Element
-        Elements to change.
-    path : Path
-        The scene file that contains them.
-    children : list of Element
-        All elements of the scene file, whose `<path>` elements name the folders to search.
-    """
-    folders = _list_folders(path, children)
+def _make_paths_absolute(elements: list[Element], folders: Sequence[Path]) -> None:
+    """Make file names in ``elements`` and their `<default>`s, which are looked up in ``folders``, absolute in place."""
     for node in (node for top in elements for node in top.iter()):
         names_file = node.tag == "default" or (node.tag == "string" and node.get("name") == "filename")
         value = node.get("value", "")
@@ -152,12 +142,15 @@ def to_verbatim(node: ElementTree.Element) -> Verbatim:
 
 def _parse_root(path: Path) -> ElementTree.Element:
     check_regular_file(path, "scene file", MAX_BYTES)
-    builder = ElementTree.TreeBuilder(insert_comments=True)
     with translate_read_errors(path, "scene file", "correct it", extra_errors=(ElementTree.ParseError,)):
-        root = ElementTree.parse(path, ElementTree.XMLParser(target=builder)).getroot()
+        root = ElementTree.parse(path, _make_parser()).getroot()
     if root.tag != "scene":
         raise NergError(f'"{path}" is not a scene file: its root element is <{sanitize(root.tag, 40)}>, not <scene>')
     return root
+
+
+def _make_parser() -> ElementTree.XMLParser:
+    return ElementTree.XMLParser(target=ElementTree.TreeBuilder(insert_comments=True))
 
 
 def _expand_includes(root: ElementTree.Element, path: Path, folders: list[Path]) -> Iterator[ElementTree.Element]:
@@ -205,91 +198,67 @@ def _list_folders(path: Path, children: list[ElementTree.Element]) -> tuple[Path
     return (path.parent, *(path.parent / child.get("value", "") for child in children if child.tag == "path"))
 
 
-# ---- Replacing the fields of a scene file ----
-
-GAZE_PROPERTY = "gaze"
-"""Name of the gaze field in the integrator."""
-
-FIELD_PROPERTY = "field"
-"""Name of the radiance field in the integrator."""
+# ---- Scene files in memory ----
 
 
-def find_field_file(path: Path, name: str) -> Path | None:
-    """Find the file of a field of a scene file, `GAZE_PROPERTY` or `FIELD_PROPERTY`; None if it has no such field.
+@dataclass(frozen=True, eq=False)
+class SceneDocument:
+    """The elements of a scene file, with absolute file names, so that its text can be loaded and written anywhere.
 
-    Raises
-    ------
-    NergError
-        The file does not contain exactly one integrator.
-    """
-    _, elements = _read_absolute_elements(path)
-    node = _find_filename(_find_volume(_find_integrator(path, elements), name))
-    value = "" if node is None else node.get("value", "")
-    return path.parent / substitute_defaults(value, resolve_defaults(elements)) if value else None
-
-
-def replace_radiance_field(path: Path, field: Path) -> str:
-    """Return the text of a scene file with another file as its radiance field, in the same place.
-
-    The text contains absolute paths, so that it can be written anywhere. Raises `NergError` if the scene has no
-    radiance field from a file.
-    """
-    version, elements = _read_absolute_elements(path)
-    node = _find_filename(_find_volume(_find_integrator(path, elements), FIELD_PROPERTY))
-    if node is None:
-        raise NergError(f'"{path}" has no radiance field from a file')
-    node.set("value", check_attribute(str(resolve_path(field))))
-    return format_document(list(map(to_verbatim, elements)), f"{path.name} with the field {field.name}.", version)
-
-
-def replace_gaze(path: Path, gaze: Path) -> str:
-    """Return the text of a scene file with another gaze field.
-
-    Parameters
+    Attributes
     ----------
-    path : Path
-        Scene file.
-    gaze : Path
-        Gaze field, which replaces that of the scene or is added.
-
-    Returns
-    -------
-    str
-        The text. It contains absolute paths, so that it can be written anywhere.
-
-    Raises
-    ------
-    NergError
-        The file does not contain exactly one integrator.
+    name : str
+        Name of the file in messages and comments.
+    version : str
+        Version of the scene format.
+    elements : list of Element
+        The elements. They are not changed in place.
     """
-    version, elements = _read_absolute_elements(path)
-    integrator = _find_integrator(path, elements)
-    volume = _find_volume(integrator, GAZE_PROPERTY)
-    if volume is not None:
-        integrator.remove(volume)
-    volume = SubElement(integrator, "volume", name=GAZE_PROPERTY, type="gazefield")
-    SubElement(volume, "string", name="filename", value=check_attribute(str(resolve_path(gaze))))
-    return format_document(list(map(to_verbatim, elements)), f"{path.name} with the gaze field {gaze.name}.", version)
 
+    name: str
+    version: str
+    elements: list[Element]
 
-def _read_absolute_elements(path: Path) -> tuple[str, list[Element]]:
-    """Read the version and the elements of a scene file, with absolute file names."""
-    version, children = read_scene_elements(path)
-    elements = [deepcopy(child) for child in children if child.tag != "path"]
-    make_paths_absolute(elements, path, children)
-    return version, elements
+    @classmethod
+    def read(cls, path: Path, values: Mapping[str, str] | None = None) -> SceneDocument:
+        """Read a scene file with ``values`` of its `<default>`s. Raises `NergError` if it is none."""
+        version, children = read_scene_elements(path, values)
+        elements = [child for child in children if child.tag != "path"]
+        _make_paths_absolute(elements, _list_folders(path, children))
+        return cls(path.name, version, elements)
 
+    @classmethod
+    def parse(cls, text: str, name: str) -> SceneDocument:
+        """Parse the ``text`` of a scene file with absolute file names, as `format_document` returns it."""
+        root = ElementTree.fromstring(text, _make_parser())
+        return cls(name, root.get("version", "3.0.0"), list(root))
 
-def _find_integrator(path: Path, children: list[Element]) -> Element:
-    integrators = [child for child in children if child.tag == "integrator"]
-    if len(integrators) != 1:
-        raise NergError(f'"{path}" has {len(integrators)} integrators, but a scene with gaze needs exactly one')
-    return integrators[0]
+    def find_integrator(self) -> Element:
+        """Return the integrator. Raises `NergError` if there is not exactly one."""
+        integrators = [element for element in self.elements if element.tag == "integrator"]
+        if len(integrators) != 1:
+            raise NergError(
+                f'"{self.name}" has {len(integrators)} integrators, but a scene with gaze needs exactly one'
+            )
+        return integrators[0]
 
+    def without_volumes(self, names: Collection[str]) -> SceneDocument:
+        """Return a copy without the volumes of the integrator of these names. Raises `NergError` as
+        `find_integrator`."""
+        copied = replace(self, elements=deepcopy(self.elements))
+        integrator = copied.find_integrator()
+        for volume in [child for child in integrator if child.tag == "volume" and child.get("name") in names]:
+            integrator.remove(volume)
+        return copied
 
-def _find_volume(integrator: Element, name: str) -> Element | None:
-    return next((child for child in integrator if child.tag == "volume" and child.get("name") == name), None)
+    def with_gaze(self, gaze: Path) -> SceneDocument:
+        """Return a copy with the gaze field of a file, which replaces that of the scene or is added. Raises
+        `NergError` as `find_integrator`."""
+        copied = self.without_volumes(["gaze"])
+        volume = SubElement(copied.find_integrator(), "volume", name="gaze", type="gazefield")
+        SubElement(volume, "string", name="filename", value=check_attribute(str(resolve_path(gaze))))
+        return copied
 
-
-def _find_filename(volume: Element | None) -> Element | None:
-    return None if volume is None else next((c for c in volume if c.get("name") == "filename"), None)
+    def to_xml(self) -> str:
+        """Return the text of the file."""
+        return format_document(list(map(to_verbatim, self.elements)), f"A copy of {self.name}.", self.version)

@@ -26,7 +26,9 @@ class PlannedFiles:
     @staticmethod
     def plan(path: str | Path, defaults: Mapping[str, str] | None = None, *extra_files: Path) -> PlannedFiles:
         """Return the scene file ``path`` with these values and additional files."""
-        return PlannedFiles(FileGroup(Path(path), (*_list_files(path, defaults), *extra_files)), dict(defaults or {}))
+        return PlannedFiles(
+            FileGroup(Path(path), (*list_scene_files(path, defaults), *extra_files)), dict(defaults or {})
+        )
 
     def checked_path(self) -> Path:
         """Return the path of the scene file.
@@ -35,15 +37,10 @@ class PlannedFiles:
         worker.
         """
         planned = {resolve_path(path) for path in self.files.members}
-        for file in _list_files(self.files.path, self.defaults):
+        for file in list_scene_files(self.files.path, self.defaults):
             if resolve_path(file) not in planned:
                 raise NergError(
                     f'the scene "{self.files.path.name}" reads "{file}", which is not the file that the job was '
                     "planned with; use paths relative to the scene, so that workers find the same files"
                 )
         return self.files.path
-
-
-def _list_files(path: str | Path, defaults: Mapping[str, str] | None) -> list[Path]:
-    """Return a file with those that it refers to, which only scene files do."""
-    return list_scene_files(path, defaults) if Path(path).suffix.lower() == ".xml" else [Path(path)]

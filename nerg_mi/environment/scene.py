@@ -40,9 +40,9 @@ from .contents import (
 )
 from .hits import NO_DATA_GREY, read_hit_volume, shade_hits
 from .kinds import ROLES, detect_kind
-from .nested_scene import make_paths_absolute, read_scene_elements, to_verbatim
+from .nested_scene import SceneDocument
 from .scene_loading import activate_mitsuba, check_sensor, load_scene
-from .scene_writer import compute_clip_distances, format_document
+from .scene_writer import compute_clip_distances
 from .trained import TrainedField
 
 COLOR = "color"
@@ -221,12 +221,7 @@ class Scene:
         path = Path(path)
         check_writable(path, ".xml")
         if self.source is not None:
-            source, values = self.source
-            version, children = read_scene_elements(source, values)
-            elements = [child for child in children if child.tag != "path"]
-            make_paths_absolute(elements, source, children)
-            nodes = [to_verbatim(child) for child in elements]
-            write_text(path, format_document(nodes, f"A copy of {source.name}.", version))
+            write_text(path, SceneDocument.read(*self.source).to_xml())
             return path
         if self._content is None:
             aovs = ",".join(self.integrator.aov_names()) and "depth,opacity"

@@ -370,14 +370,19 @@ class PlacedScene:
 
     def load(self, **defaults: object) -> Any:
         """Load the scene with Mitsuba, with values of its `<default>`s by their names in a scene of `write_scene`."""
-        content, gaze = self.text.content, self.text.gaze_files
+        content = self.text.content
         values = {free_default_name(name, content.reserved_names): str(value) for name, value in defaults.items()}
-        volumes = dict(content.volumes)
+        return load_scene_text(self.text.to_xml(), values, load_objects(self.volumes), load_objects(content.shapes))
+
+    @property
+    def volumes(self) -> dict[str, Any]:
+        """What has no file, by name, as in `SceneContent`: children of the integrator."""
+        volumes, gaze = dict(self.text.content.volumes), self.text.gaze_files
         if isinstance(gaze.gaze, GazeField):
             volumes["gaze"] = FieldVolume(gaze.gaze, "gaze")
         if isinstance(gaze.rays, Rays):
             volumes["kde"] = make_kde_volume(gaze.rays, gaze.align)
-        return load_scene_text(self.text.to_xml(), values, load_objects(volumes), load_objects(content.shapes))
+        return volumes
 
     def save(self, output: Path, reporter: Reporter) -> WrittenScene:
         """Write the scene file ``output``, and what has no file next to it. Raises `NergError`."""

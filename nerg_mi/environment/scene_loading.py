@@ -18,7 +18,6 @@ from nerg_mi import __version__, llvm
 from nerg_mi.errors import NergError, UnusableLLVM, format_error, translate_mitsuba_errors
 from nerg_mi.files.images import check_image, ensure_two_threads
 from nerg_mi.files.safe_read import check_regular_file, open_file, resolve_path
-from nerg_mi.formats.meshes import READERS as MESHES
 from nerg_mi.maths.coordinates import check_coordinates
 from nerg_mi.maths.transforms import check_rigid_transforms
 from nerg_mi.properties import resolve_scene_file
@@ -86,10 +85,10 @@ def _check_scene_text(text: str, defaults: Mapping[str, str]) -> None:
 def list_scene_files(path: str | Path, defaults: Mapping[str, str] | None = None) -> list[Path]:
     """List a scene file and the existing files that it names: includes, meshes, fields and textures.
 
-    A mesh file is its own only file. Parameters and errors as for `check_scene_file`.
+    Another file is its own only file. Parameters and errors as for `check_scene_file`.
     """
     path = Path(path)
-    if path.suffix.lower() in MESHES:
+    if path.suffix.lower() != ".xml":
         return [path]
     reader = _SceneFileChecker(path.parent, {k: str(v) for k, v in (defaults or {}).items()})
     reader.check(path)

@@ -24,13 +24,25 @@ MAX_CHECKPOINT_BYTES = 16 << 30  # maximum size of a checkpoint in bytes
 MAX_HEADER_BYTES = 16 << 20  # maximum size of the header, which contains array names and metadata, in bytes
 
 
-def write_checkpoint(path: str | Path, kind: str, tensors: dict[str, np.ndarray], metadata: dict) -> None:
-    """Write ``tensors`` and ``metadata`` (JSON) atomically as a checkpoint of ``kind``."""
+def encode_checkpoint(kind: str, tensors: dict[str, np.ndarray], metadata: dict) -> bytes:
+    """Encode ``tensors`` and ``metadata`` (JSON) as a checkpoint of ``kind``."""
     from safetensors.numpy import save
 
     header = {"nerg": json.dumps({"format": FORMAT, "kind": kind, **metadata}, allow_nan=False)}
-    data = save({k: np.ascontiguousarray(v) for k, v in tensors.items()}, metadata=header)
-    write_bytes(path, data)
+    return save({k: np.ascontiguousarray(v) for k, v in tensors.items()}, metadata=header)
+
+
+def decode_checkpoint(data: bytes) -> tuple[dict[str, np.ndarray], dict]:
+    """Decode the tensors and the metadata of `encode_checkpoint`, which are not checked as those of a file are."""
+    from safetensors.numpy import load
+
+    header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
+    return load(data), json.loads(header["__metadata__"]["nerg"])
+
+
+def write_checkpoint(path: str | Path, kind: str, tensors: dict[str, np.ndarray], metadata: dict) -> None:
+    """Write ``tensors`` and ``metadata`` (JSON) atomically as a checkpoint of ``kind``."""
+    write_bytes(path, encode_checkpoint(kind, tensors, metadata))
 
 
 def read_checkpoint(path: str | Path, kind: str) -> tuple[dict[str, np.ndarray], dict]:

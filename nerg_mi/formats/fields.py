@@ -28,13 +28,13 @@ from nerg_mi.fields.mlp import MLP
 from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid, RefinedGrid, unpack_bits
 from nerg_mi.fields.radiance import EMPTY, Background, BackgroundConfig, RadianceConfig, RadianceNetwork
 from nerg_mi.fields.voxels import VoxelArrays, VoxelGrid
-from nerg_mi.files.atomic import file_sha256
+from nerg_mi.files.atomic import file_sha256, write_bytes
 from nerg_mi.files.safe_read import describe_error
 from nerg_mi.maths.arrays import copy_aligned
 from nerg_mi.maths.geometry import box_from_dict
 from nerg_mi.ranges import MAX_COORDINATE, POSITIVE_VALUES
 
-from .checkpoint import read_checkpoint, read_metadata, write_checkpoint
+from .checkpoint import decode_checkpoint, encode_checkpoint, read_checkpoint, read_metadata, write_checkpoint
 
 # ---- Checks of the sizes in a checkpoint, before they are used ----
 #
@@ -283,8 +283,13 @@ def _decode_voxels(arrays: StoredArrays, config: dict) -> VoxelGrid:
 def save_radiance(
     field: RadianceNetwork, path: str | Path, provenance: dict, half: bool = False, origin: str | None = None
 ) -> None:
-    """Write ``field``. ``provenance`` (JSON) describes the training data and settings; ``half`` stores the
-    weights as fp16; ``origin`` is the checksum of the file that the field was compiled or refined from.
+    """Write ``field``. Other parameters as for `encode_radiance`."""
+    write_bytes(path, encode_radiance(field, provenance, half, origin))
+
+
+def encode_radiance(field: RadianceNetwork, provenance: dict, half: bool = False, origin: str | None = None) -> bytes:
+    """Encode ``field`` as a checkpoint. ``provenance`` (JSON) describes the training data and settings; ``half`` stores
+    the weights as fp16; ``origin`` is the checksum of the file that the field was compiled or refined from.
     """
     parameters = {name: value for name, value in field.parameters().items() if not name.startswith("voxels.")}
     tensors = to_stored_arrays(parameters, half)
@@ -306,7 +311,7 @@ def save_radiance(
         tensors |= arrays
     if field.background is not None:
         metadata["background"] = field.background.config.to_dict()
-    write_checkpoint(path, "radiance", tensors, metadata)
+    return encode_checkpoint("radiance", tensors, metadata)
 
 
 def load_radiance(path: str | Path, ns: ModuleType) -> tuple[RadianceNetwork, dict[str, Any]]:
@@ -315,7 +320,17 @@ def load_radiance(path: str | Path, ns: ModuleType) -> tuple[RadianceNetwork, di
 
     Raises `NergError` if the file contains no radiance field.
     """
-    tensors, meta = read_checkpoint(path, "radiance")
+    return _build_radiance(*read_checkpoint(path, "radiance"), path, ns)
+
+
+def decode_radiance(data: bytes, ns: ModuleType) -> tuple[RadianceNetwork, dict[str, Any]]:
+    """As `load_radiance`, of the result of `encode_radiance`."""
+    return _build_radiance(*decode_checkpoint(data), "in memory", ns)
+
+
+def _build_radiance(
+    tensors: dict[str, np.ndarray], meta: dict, path: str | Path, ns: ModuleType
+) -> tuple[RadianceNetwork, dict[str, Any]]:
     meta["half"] = any(tensor.dtype == np.float16 for tensor in tensors.values())
     if meta.get("provenance", {}).get("quality") == "poor":
         _warn_once(

@@ -10,26 +10,22 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from nerg_mi.environment.radiance import RadianceField
+from nerg_mi.environment.scene_loading import get_array_module
 from nerg_mi.errors import NergError, sanitize
 from nerg_mi.files.atomic import file_sha256
 from nerg_mi.formats.checkpoint import read_metadata
+from nerg_mi.formats.fields import decode_radiance, encode_radiance
 
-_PROGRAM = "import sys, nerg_mi; nerg_mi.compile_field(sys.argv[1]).save(sys.argv[2])"
+_PROGRAM = "from nerg_mi.viewer.compilation import compile_stream; compile_stream()"
 
 
-def find_compiled_file(field: Path, folder: Path) -> Path:
-    """Return the file of the compiled copy of ``field``.
-
-    It is next to the field, or in ``folder`` if nothing can be written there or another file has its name.
-    """
+def find_compiled_file(field: Path) -> Path | None:
+    """Return the file of the compiled copy of ``field``, next to it; None if nothing can be written there, or another
+    file has its name."""
     beside = field.with_name(f"{field.stem}.compiled.safetensors")
     is_other = beside.exists() and _read_origin(beside) is None
-    return folder / beside.name if is_other or not os.access(field.parent, os.W_OK) else beside
-
-
-def is_compiled(field: Path) -> bool:
-    """Whether the checkpoint ``field`` has voxels."""
-    return "voxels" in read_metadata(field)
+    return None if is_other or not os.access(field.parent, os.W_OK) else beside
 
 
 def is_current(compiled: Path, field: Path) -> bool:
@@ -48,36 +44,52 @@ def _read_origin(path: Path) -> str | None:
     return metadata.get("refined_from") if "voxels" in metadata else None
 
 
+def compile_stream(**options: Any) -> None:
+    """Compile the radiance field whose checkpoint is on standard input, as ``nerg compile`` does with ``options``, and
+    write the result to standard output."""
+    import nerg_mi  # the function above this package
+
+    # What Mitsuba and others print goes to standard error.
+    output = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    network, metadata = decode_radiance(sys.stdin.buffer.read(), get_array_module())
+    field = RadianceField(network, metadata["provenance"], origin=metadata.get("refined_from"), half=metadata["half"])
+    compiled = nerg_mi.compile_field(field, **options)
+    with output:
+        output.write(encode_radiance(compiled.network, dict(compiled.provenance), compiled.half, compiled.origin))
+
+
 class BackgroundCompilation:
-    """A process that compiles ``field`` to ``output``, as ``nerg compile`` does by default.
+    """A process that compiles a radiance field, as ``nerg compile`` does by default.
 
     Parameters
     ----------
-    field, output : Path
-        Radiance field, and the file to write.
+    field : bytes
+        Checkpoint of the field.
+    name : str
+        Name of the field in messages.
     on_done : callable
-        Called with ``output`` on a thread of its own when the file is complete.
+        Called with the checkpoint of the compiled field on a thread of its own.
     on_error : callable
         Called with a `NergError` if the process fails.
     """
 
     def __init__(
-        self, field: Path, output: Path, on_done: Callable[[Path], Any], on_error: Callable[[BaseException], Any]
+        self, field: bytes, name: str, on_done: Callable[[bytes], Any], on_error: Callable[[BaseException], Any]
     ):
-        self._field, self._output, self._on_done, self._on_error = field, output, on_done, on_error
+        self._name, self._on_done, self._on_error = name, on_done, on_error
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
         # In its own session, so that Ctrl-C ends the viewer, which then ends the process.
         self._process = subprocess.Popen(
-            [sys.executable, "-c", _PROGRAM, str(field), str(output)],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
+            [sys.executable, "-c", _PROGRAM],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             env=environment,
             start_new_session=True,
-            text=True,
         )
         self._is_stopped = False
-        self._thread = threading.Thread(target=self._wait, name="nerg-view-compile", daemon=True)
+        self._thread = threading.Thread(target=self._wait, args=(field,), name="nerg-view-compile", daemon=True)
         self._thread.start()
 
     def stop(self) -> None:
@@ -86,13 +98,16 @@ class BackgroundCompilation:
         self._process.terminate()
         self._thread.join()
 
-    def _wait(self) -> None:
-        _, text = self._process.communicate()
+    def _wait(self, field: bytes) -> None:
+        compiled, text = self._process.communicate(field)
         if self._is_stopped:
             return
         if self._process.returncode == 0:
-            self._on_done(self._output)
+            try:
+                self._on_done(compiled)
+            except NergError as error:
+                self._on_error(error)
             return
-        lines = text.strip().splitlines()
+        lines = text.decode(errors="replace").strip().splitlines()
         reason = sanitize(lines[-1], 200) if lines else f"exit code {self._process.returncode}"
-        self._on_error(NergError(f'"{self._field}" is shown uncompiled, since "nerg compile" failed: {reason}'))
+        self._on_error(NergError(f"{self._name} is shown uncompiled, since its compilation failed: {reason}"))

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.aoi.areas import format_areas
-from nerg_mi.environment.scene_loading import list_scene_files
 from nerg_mi.errors import NergError, clean_text, format_error
 from nerg_mi.figures.style import Provenance, make_provenance
 from nerg_mi.files.images import encode_png
@@ -114,7 +113,7 @@ class Controls:
 
     def _build_display(self) -> None:
         session, gui = self.session, self.gui
-        names = list(session.source.variants)
+        names = list(session.source.gaze)
         variant = gui.add_dropdown("Gaze field", names, initial_value=session.gaze_name) if len(names) > 1 else None
         titles = [layer.title for layer in session.layers]
         layer = gui.add_dropdown("Layer", titles, initial_value=session.display.layer.title)
@@ -417,7 +416,7 @@ def picture_provenance(session: Any, window: BrowserWindow) -> Provenance:
         "samples": window.last_picture[0].samples,
         "ceiling": session.ceiling,
     }
-    return make_provenance("nerg view", list_scene_files(session.scene_file), 0, settings, session.checksums)
+    return make_provenance("nerg view", session.source.list_files(session.gaze_name), 0, settings, session.checksums)
 
 
 def encode_picture(session: Any, colors: np.ndarray, text: dict[str, str] | None = None) -> bytes:

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Iterator
 from copy import deepcopy
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element, SubElement
 
 import matplotlib
 import numpy as np
 
-from nerg_mi.environment.nested_scene import make_paths_absolute, read_scene_elements, to_verbatim
+from nerg_mi.environment.nested_scene import SceneDocument, to_verbatim
 from nerg_mi.environment.queries import trace
 from nerg_mi.environment.scene_writer import Comment, element, format_document, format_numbers, prop
-from nerg_mi.errors import NergError
 
 from . import layers
 from .page import Page
@@ -67,12 +66,12 @@ class ViewSettings:
     ceiling: tuple[float, np.ndarray] | None = None
 
 
-def copy_scene(path: Path, settings: ViewSettings) -> str:
+def copy_scene(document: SceneDocument, settings: ViewSettings) -> str:
     """Copy a scene file with another camera, observer and settings.
 
     Parameters
     ----------
-    path : Path
+    document : SceneDocument
         Scene file.
     settings : ViewSettings
         Camera, observer and settings of the copy.
@@ -87,7 +86,6 @@ def copy_scene(path: Path, settings: ViewSettings) -> str:
     NergError
         The file does not contain exactly one integrator.
     """
-    version, children = read_scene_elements(path)
     observer_defaults = (
         []
         if settings.observer is None
@@ -98,21 +96,18 @@ def copy_scene(path: Path, settings: ViewSettings) -> str:
         ("default", OBSERVER_DEFAULT) for _ in observer_defaults
     }
     key = lambda child: (child.tag, child.get("id" if child.tag == "sensor" else "name"))
-    copies = [deepcopy(child) for child in children if child.tag != "path" and key(child) not in replaced]
-    integrators = [child for child in copies if child.tag == "integrator"]
-    if len(integrators) != 1:
-        raise NergError(f'"{path}" has {len(integrators)} integrators, but a copy needs exactly one')
-    make_paths_absolute(copies, path, children)
-    _update_integrator(integrators[0], settings)
+    elements = [child for child in document.elements if key(child) not in replaced]
+    copy = dataclasses.replace(document, elements=deepcopy(elements))
+    _update_integrator(copy.find_integrator(), settings)
     nodes = [
         element("default", name=CAMERA_DEFAULT, value=format_numbers(settings.view.origin)),
         element("default", name=TARGET_DEFAULT, value=format_numbers(settings.view.target)),
         *observer_defaults,
         _make_sensor(settings),
         Comment("The rest is copied from the original scene. Its sensors come after the sensor above."),
-        *map(to_verbatim, copies),
+        *map(to_verbatim, copy.elements),
     ]
-    return format_document(nodes, f"A view of {path.name}, saved by nerg view.", version)
+    return format_document(nodes, f"A view of {document.name}, saved by nerg view.", document.version)
 
 
 def _update_integrator(integrator: Element, settings: ViewSettings) -> None:
@@ -162,16 +157,12 @@ def _make_sensor(settings: ViewSettings):
 def copy_view(session: Any, view: PinholeView) -> str:
     """Return a scene file of ``view`` with the observer, the layer and the settings of ``session``.
 
-    Raises `NergError` if the scene depends on temporary files of the viewer.
+    Raises `NergError` if the scene shows objects in memory.
     """
-    if session.source.made and session.scene_file.with_suffix(".vol").exists():
-        raise NergError(
-            'the viewer reconstructed this scene from gaze samples in a temporary folder; use "nerg scene" to write it'
-        )
     aovs = tuple(name for name in layers.required_quantities(session.display.layer) if name != "color")
     ceiling = None if session.ceiling is None else (session.ceiling, session.ceiling_up)
     settings = session.settings.width, session.spp, session.falloff, ceiling
-    return copy_scene(session.scene_file, ViewSettings(view, session.observer, aovs, *settings))
+    return copy_scene(session.source.describe(session.gaze_name), ViewSettings(view, session.observer, aovs, *settings))
 
 
 # ---- Participants ----

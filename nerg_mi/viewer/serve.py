@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import atexit
-import tempfile
 import threading
 from collections.abc import Sequence
 from contextlib import ExitStack
-from pathlib import Path
 from typing import Annotated
 
 from nerg_mi.aoi.areas import AnyAreas, Areas
@@ -153,12 +151,11 @@ def view(
     settings = SessionSettings(width, spp, observer, shown, compile)
     variant = activate_mitsuba().variant()
     with open_reporter(progress) as reporter, ExitStack() as resources:
-        folder = Path(resources.enter_context(tempfile.TemporaryDirectory()))
 
         def load() -> ViewerScene:
             # On the render thread.
             activate_variant(variant)
-            return open_viewer_scene(inputs, folder, observer=observer, up=up, align=align, reporter=reporter)
+            return open_viewer_scene(inputs, observer=observer, up=up, align=align, reporter=reporter)
 
         server = start_server(guard, port, "nerg view")
         page = Page(server)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -14,21 +15,22 @@ from nerg_mi.aoi.areas import Area, Areas
 from nerg_mi.aoi.attention import make_shape_aois
 from nerg_mi.aoi.placed import Aoi
 from nerg_mi.environment.arrays import check_point
-from nerg_mi.environment.nested_scene import FIELD_PROPERTY, find_field_file, replace_radiance_field
 from nerg_mi.environment.queries import trace
-from nerg_mi.environment.scene import COLOR, Scene
-from nerg_mi.environment.scene_loading import activate_mitsuba, load_scene
+from nerg_mi.environment.scene import COLOR
+from nerg_mi.environment.scene_loading import activate_mitsuba, get_array_module
 from nerg_mi.errors import NergError, parameter, translate_mitsuba_errors
 from nerg_mi.figures.layers import describe_basis
-from nerg_mi.files.atomic import write_text
+from nerg_mi.files.atomic import file_sha256, write_bytes
 from nerg_mi.formats.boxes import Region
+from nerg_mi.formats.fields import decode_radiance, encode_radiance, load_radiance
 from nerg_mi.progress import SILENT
 from nerg_mi.ranges import MAX_COORDINATE
+from nerg_mi.registration import get_plugin_class
 from nerg_mi.transport.extrapolation import describe_extrapolation
 from nerg_mi.transport.geometry import Ceiling
 
 from . import layers
-from .compilation import BackgroundCompilation, find_compiled_file, is_compiled, is_current
+from .compilation import BackgroundCompilation, find_compiled_file, is_current
 from .layers import DisplaySettings, Layer, Scale
 from .points import (
     BAND_SIZES,
@@ -152,8 +154,8 @@ class Session:
         self.regions: list[Region] = []
         self.other_areas: list[Area] = []
         self.band_pace, self.frame_pace = BandPace(), FramePace()
-        # The compiled copy of the radiance field, and the process that makes it.
-        self.compiled: Path | None = None
+        # The volume of the compiled radiance field, and the process that compiles it.
+        self.compiled: Any = None
         self._compilation: BackgroundCompilation | None = None
         self.checksums: dict[Path, str] = {}
         self._ranges: dict[str, tuple[float, float]] = {}
@@ -172,7 +174,8 @@ class Session:
         """
         self.worker.call(self._load).result()
         self.worker.submit("proxy", NORMAL_PRIORITY, self._gather())
-        self._start_compilation()
+        if self.settings.compile:
+            self.worker.call(self._start_compilation).result()
 
     def stop(self) -> None:
         """Stop the render thread and the compilation of the field."""
@@ -182,21 +185,36 @@ class Session:
 
     def _start_compilation(self) -> None:
         """Use the compiled copy of the radiance field; make it in the background if there is none."""
-        field = find_field_file(self.source.scene, FIELD_PROPERTY) if self.settings.compile else None
-        if field is None or field.suffix != ".safetensors" or is_compiled(field):
+        volume = self.scene.integrator.children.get("field")
+        if not isinstance(volume, get_plugin_class("nerf")) or volume.field.voxels is not None:
             return
-        compiled = find_compiled_file(field, self.source.folder)
-        if is_current(compiled, field):
-            self._use_compiled(compiled)
-        else:
-            self._compilation = BackgroundCompilation(field, compiled, self._use_compiled, self.listener.on_error)
+        # A field in memory has no metadata.
+        file = Path(volume.filename) if volume.metadata else None
+        cached = None if file is None else find_compiled_file(file)
+        if file is not None and cached is not None and is_current(cached, file):
+            self._use_compiled(partial(load_radiance, cached))
+            return
+        origin = None if file is None else volume.metadata.get("refined_from") or file_sha256(file)
+        provenance, half = volume.metadata.get("provenance", {}), volume.metadata.get("half", False)
 
-    def _use_compiled(self, compiled: Path) -> None:
-        """Render with the ``compiled`` copy of the radiance field from now on."""
+        def finish(compiled: bytes) -> None:
+            self._use_compiled(partial(decode_radiance, compiled))
+            if cached is not None:
+                write_bytes(cached, compiled)
+
+        encoded = encode_radiance(volume.field, provenance, half, origin)
+        self._compilation = BackgroundCompilation(encoded, f'"{volume.filename}"', finish, self.listener.on_error)
+
+    def _use_compiled(self, load: Callable[[Any], tuple[Any, dict]]) -> None:
+        """Render with the compiled radiance field that ``load`` returns for a backend from now on."""
 
         def steps() -> Iterator[None]:
-            self.compiled = compiled
-            self._load_scene(self.scene_file)
+            import mitsuba as mi
+
+            volume = self.scene.integrator.children["field"]
+            to_world = mi.ScalarTransform4d(volume.medium().to_world.matrix)
+            self.compiled = type(volume).from_network(load(get_array_module())[0], to_world, volume.filename)
+            self._load_scene(self.gaze_name)
             self._set_falloff()
             self.frame_pace = FramePace()
             yield
@@ -210,13 +228,12 @@ class Session:
     def _load(self) -> None:
         self.source = self._load_source()
         self.variant = activate_mitsuba().variant()
-        self.gaze_name = next(iter(self.source.variants), "")
-        self._load_scene(self.source.scene)
+        self._load_scene(next(iter(self.source.gaze), ""))
         self.display = DisplaySettings(self._default_layer())
         sensors = self.scene.mitsuba.sensors()
         if not sensors:
             raise NergError(
-                f'"{self.source.scene}" has gaze, but no sensor for the initial view; add a <sensor> to the scene, or '
+                f'"{self.source.name}" has gaze, but no sensor for the initial view; add a <sensor> to the scene, or '
                 "in Python a camera by make_scene"
             )
         self.home_view = PinholeView.from_sensor(sensors[0])
@@ -238,13 +255,9 @@ class Session:
         shapes = [shape.id() for shape in self.scene.mitsuba.shapes() if shape.is_mesh()]
         self.shapes = [name for name in shapes if name and not name.startswith("__")][:_MAX_SHAPES]
 
-    def _load_scene(self, scene_file: Path) -> None:
-        """Load a scene file and use it from now on."""
-        self.scene_file, shown = scene_file, scene_file
-        if self.compiled is not None:
-            shown = self.source.folder / f"{scene_file.stem}.compiled.xml"
-            write_text(shown, replace_radiance_field(scene_file, self.compiled))
-        self.scene = Scene(load_scene(shown))
+    def _load_scene(self, gaze: str) -> None:
+        """Load the scene with the gaze field of this name and the compiled radiance field, and use it from now on."""
+        self.scene, self.gaze_name = self.source.load(gaze, self.compiled), gaze
         self._shape_aois: list[Aoi] | None = None
         self.layers = layers.list_layers(self.scene)
         self.basis = describe_basis(self.scene.mitsuba)
@@ -326,8 +339,7 @@ class Session:
         """
 
         def change() -> None:
-            self._load_scene(self.source.variants[name])
-            self.gaze_name = name
+            self._load_scene(name)
             self._set_falloff()
             self._invalidate()
             with self.lock:

@@ -314,8 +314,8 @@ def test_environments_are_shown(rgb_module, rays, tmp_path, kind):
         # Without the objects, from the files of the training.
         report = nerg.report(tmp_path / "gaze.safetensors", width=24, spp=1, viewpoints=1)
         assert "density" in written.integrator.children and len(report.html) > 10_000
-    shown = open_viewer_scene([environment, gaze], tmp_path)
-    np.testing.assert_allclose(depths(nerg.Scene.load(shown.scene)), depths(written), atol=1e-4)
+    shown = open_viewer_scene([environment, gaze]).load("")
+    np.testing.assert_allclose(depths(shown), depths(written), atol=1e-4)
 
 
 def test_recordings_are_aligned_with_a_grid(rgb_module):

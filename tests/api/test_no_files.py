@@ -1,4 +1,4 @@
-"""A study in memory writes no file."""
+"""Studies and viewers in memory write no file."""
 
 from __future__ import annotations
 
@@ -11,21 +11,27 @@ import pytest
 
 from tests.conftest import ROOT
 
-STUDY = """
+HOOK = """
 import json, os, sys
-import matplotlib.font_manager, numpy as np, pandas as pd, trimesh  # Matplotlib writes its cache when it is imported
+import matplotlib.font_manager, numpy as np, trimesh  # Matplotlib writes its cache when it is imported
 import nerg_mi as nerg
 written = []
 
 
 def note_writing(event, args):
-    if event == "open" and isinstance(args[2], int) and args[2] & (os.O_WRONLY | os.O_RDWR | os.O_CREAT):
+    # A number is a pipe to another process.
+    is_file = event == "open" and not isinstance(args[0], int)
+    if is_file and isinstance(args[2], int) and args[2] & (os.O_WRONLY | os.O_RDWR | os.O_CREAT):
         written.append(str(args[0]))
     if event in ("os.mkdir", "os.rename", "tempfile.mkstemp", "tempfile.mkdtemp"):
         written.append(f"{event} {args[0]}")
 
 
 sys.addaudithook(note_writing)
+"""
+
+STUDY = """
+import pandas as pd
 rng = np.random.default_rng(0)
 eyes = np.array([(1.2, 1.2, 1.6), (4.5, 2.8, 1.6)])[np.arange(600) // 300] + rng.uniform(-0.1, 0.1, (600, 3))
 seen = rng.uniform((0, 0, 0), (6, 4, 3), (600, 3)) - eyes
@@ -51,12 +57,63 @@ print(json.dumps({"written": written, "kld": scores.rows[0]["KLD"], "share": sha
 """
 
 
+VIEWER = """
+import drjit.llvm.ad as ns
+import mitsuba as mi
+
+mi.set_variant("llvm_ad_rgb")
+from nerg_mi.fields.encoding import HashGridConfig
+from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
+from nerg_mi.fields.radiance import RadianceConfig, RadianceNetwork
+from nerg_mi.maths.geometry import Box
+from nerg_mi.viewer import compilation
+
+compilation._PROGRAM = compilation._PROGRAM.replace("()", "(resolution=32)")
+grid, box = HashGridConfig(levels=2, log2_rows=10, base=4, finest=16), Box((-1, -1, -1), (1, 1, 1))
+field = nerg.RadianceField(RadianceNetwork.random(RadianceConfig(grid=grid), box, ns, 0))
+config = LogGazeConfig(grid=grid, width=16, prior=8)
+gaze = [nerg.GazeField(LogGazeField.random(config, box, ns, seed, np.zeros((8, 16)))) for seed in (1, 2)]
+rays = nerg.Rays.from_arrays(np.full((9, 3), 0.1), np.ones((9, 3)), times=np.arange(9), participants=["a"] * 9)
+pictures = []
+with nerg.view([field, *gaze, rays], observer=(0.1, 0, 0), width=32, spp=1, port=0) as viewer:
+    session = viewer.page.session
+    names, compilation = list(session.source.gaze), session._compilation
+    session.place_observer(np.array([0.2, 0, 0]))
+    session.select_gaze(names[1])
+    compilation._thread.join(300)
+    session.refine_picture("test", session.home_view, lambda picture, colors: pictures.append(colors.shape), 32, 1)
+    assert session.worker.wait_idle(300) and viewer.page.problem == "", viewer.page.problem
+    voxels = session.scene.integrator.medium.field.voxels
+    print(json.dumps({"written": written, "voxels": voxels.resolution, "pictures": pictures, "names": names}))
+mesh = trimesh.creation.box((6, 4, 3))
+with nerg.view(mesh, observer=(0.1, 0, 0), port=0) as viewer:
+    assert viewer.page.session.worker.wait_idle(300)
+assert not written, written
+"""
+
+
+def run_script(script, folder):
+    """Run the script and return the result that it prints, with the files that it has ``written``."""
+    environment = {**os.environ, "TMPDIR": str(folder), "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        [sys.executable, "-c", HOOK + script], capture_output=True, text=True, cwd=folder, env=environment
+    )
+    assert done.returncode == 0, done.stderr
+    assert not list(folder.iterdir())
+    return json.loads(next(line for line in done.stdout.splitlines() if line.startswith("{")))
+
+
 @pytest.mark.slow
 def test_a_study_of_a_data_frame_and_a_mesh_writes_no_file(tmp_path):
     pytest.importorskip("pandas")
-    environment = {**os.environ, "TMPDIR": str(tmp_path), "PYTHONPATH": str(ROOT)}
-    done = subprocess.run([sys.executable, "-c", STUDY], capture_output=True, text=True, cwd=tmp_path, env=environment)
-    assert done.returncode == 0, done.stderr
-    result = json.loads(done.stdout.splitlines()[-1])
-    assert result["html"] == "<!DOCTYPE html>" and result["written"] == [] and not list(tmp_path.iterdir())
+    result = run_script(STUDY, tmp_path)
+    assert result["html"] == "<!DOCTYPE html>" and result["written"] == []
     assert result["kld"] > 0 and 0 < result["share"][0] < 1 and result["interval"][0] < result["interval"][1]
+
+
+@pytest.mark.slow
+def test_a_viewer_of_objects_in_memory_writes_no_file(tmp_path):
+    pytest.importorskip("viser")
+    result = run_script(VIEWER, tmp_path)
+    assert result["written"] == [] and result["voxels"] == 32
+    assert result["names"] == ["gaze 0", "gaze 1"] and result["pictures"]

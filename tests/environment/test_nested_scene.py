@@ -8,7 +8,7 @@ from nerg_mi.scenes.store import SCENE_FILE
 
 import nerg_mi as nerg
 from nerg_mi.environment.bands import render_channels
-from nerg_mi.environment.nested_scene import GAZE_PROPERTY, find_field_file, nest_scene, replace_gaze
+from nerg_mi.environment.nested_scene import SceneDocument, nest_scene
 from nerg_mi.environment.scene_loading import load_scene
 from nerg_mi.environment.scene_writer import GazeFiles, LookAt, SceneText
 from nerg_mi.errors import NergError
@@ -131,14 +131,15 @@ NERG = """<integrator type="nerg"><volume name="gaze" type="gazefield"><string n
 </integrator>"""
 
 
-def test01_find_field_file(tmp_path):
-    path = tmp_path / "a.xml"
-    path.write_text(PLAIN.format(NERG))
-    assert find_field_file(path, GAZE_PROPERTY) == tmp_path / "a.bin"
-    path.write_text(PLAIN.format('<integrator type="nerg"/>'))
-    assert find_field_file(path, GAZE_PROPERTY) is None
-    store = SCENE_FILE
-    assert find_field_file(store, GAZE_PROPERTY) == store.parent.resolve() / "shoppers.safetensors"
+def test01_gaze_is_replaced_or_added(tmp_path):
+    path, names = tmp_path / "a.xml", []
+    for integrator in (NERG, '<integrator type="nerg"/>'):
+        path.write_text(PLAIN.format(integrator))
+        document = SceneDocument.read(path)
+        again = SceneDocument.parse(document.with_gaze(tmp_path / "b.bin").to_xml(), "again").find_integrator()
+        names.append([node.get("value") for node in again.iter("string")])
+        assert len(document.find_integrator()) == (integrator is NERG), "a copy is changed"
+    assert names == [[str((tmp_path / "b.bin").resolve())]] * 2
 
 
 @pytest.mark.parametrize("count", [0, 2])
@@ -146,7 +147,7 @@ def test02_exactly_one_integrator_is_required(tmp_path, count):
     path = tmp_path / "a.xml"
     path.write_text(PLAIN.format('<integrator type="nerg"/>' * count))
     with pytest.raises(NergError, match=f"has {count} integrators"):
-        replace_gaze(path, tmp_path / "b.bin")
+        SceneDocument.read(path).with_gaze(tmp_path / "b.bin")
 
 
 @pytest.mark.slow
@@ -155,8 +156,7 @@ def test03_replaced_gaze_renders_the_same(rgb, tmp_path):
     store = SCENE_FILE
     other = tmp_path / "other.safetensors"
     other.write_bytes((store.parent / "shoppers.safetensors").read_bytes())
-    (tmp_path / "copy.xml").write_text(replace_gaze(store, other))
-    assert find_field_file(tmp_path / "copy.xml", GAZE_PROPERTY) == other.resolve()
+    (tmp_path / "copy.xml").write_text(SceneDocument.read(store).with_gaze(other).to_xml())
     at, ahead = [(4.4, 2.8, 1.6)] * 16, np.random.default_rng(1).normal(size=(16, 3))
     ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
     image = [nerg.trace(nerg.Scene.load(path), at, ahead, ["gaze", "depth"]) for path in (store, tmp_path / "copy.xml")]

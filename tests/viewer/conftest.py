@@ -117,12 +117,12 @@ class CountingListener:
 
 
 @pytest.fixture
-def make_session(tmp_path):
+def make_session():
     made = []
 
     def make(path, *other_files, **options) -> Session:
         settings = SessionSettings(**{"compile": False, **options})
-        load = lambda: open_viewer_scene([path, *other_files], tmp_path, observer=settings.observer)
+        load = lambda: open_viewer_scene([path, *other_files], observer=settings.observer)
         session = Session(load, settings, CountingListener())
         made.append(session)
         session.start()

@@ -7,9 +7,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import trimesh
 
 import nerg_mi as nerg
-from nerg_mi.environment.nested_scene import replace_gaze
+from nerg_mi.environment.nested_scene import SceneDocument
 from nerg_mi.errors import NergError
 from nerg_mi.figures.overlay import Heat, overlay, to_bytes
 from nerg_mi.figures.style import LINE, hatch_lines
@@ -20,6 +21,7 @@ from nerg_mi.viewer.layers import STALE_STYLE, DisplaySettings, Scale, get_layer
 from nerg_mi.viewer.points import PinholeView
 from nerg_mi.viewer.scene import copy_view
 from nerg_mi.viewer.shares import AttentionShare
+from nerg_mi.viewer.source import open_viewer_scene
 from nerg_mi.viewer.worker import Worker
 
 # ---- Boxes fitted to a rectangle ----
@@ -98,12 +100,11 @@ def test06_slider_range_contains_value(value, end):
 
 
 def test07_copied_view_is_a_scene(store, tmp_path):
-    place = SimpleNamespace(made=False)
     settings = SimpleNamespace(width=48)
     view = PinholeView.look_at((7, 3, 2), (5, 4, 1), (0, 0, 1), 0.9, 1.5)
     shown = SimpleNamespace(
-        source=place,
-        scene_file=store,
+        source=open_viewer_scene(store),
+        gaze_name="",
         display=DisplaySettings(get_layer("gaze")),
         observer=np.array([5, 3, 1.6]),
         settings=settings,
@@ -116,9 +117,8 @@ def test07_copied_view_is_a_scene(store, tmp_path):
     assert scene.integrator.aov_names() == ["depth.T", "opacity.Y", "gaze.Y"] and np.allclose(
         scene.observer, [5, 3, 1.6]
     )
-    shown.source, shown.scene_file = SimpleNamespace(made=True), tmp_path / "scene.xml"
-    (tmp_path / "scene.vol").touch()
-    with pytest.raises(NergError, match="nerg scene"):
+    shown.source = open_viewer_scene(trimesh.creation.box((4, 3, 2.5)), observer=(0, 0, 0))
+    with pytest.raises(NergError, match="objects in memory"):
         copy_view(shown, view)
 
 
@@ -150,7 +150,7 @@ def test10_missing_factor_has_no_layer(room, gaze_fields, tmp_path):
     factors = {"attention that surfaces attract", "attention that the observer gives"}
     for path, expected in zip(gaze_fields, (factors, {"attention that surfaces attract"})):
         scene = tmp_path / "with.xml"
-        scene.write_text(replace_gaze(room, path))
+        scene.write_text(SceneDocument.read(room).with_gaze(path).to_xml())
         titles = {la.title for la in layers.list_layers(nerg.Scene.load(scene))}
         assert "gaze" in titles and titles & factors == expected
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import nerg_mi as nerg
+from nerg_mi.environment.nested_scene import SceneDocument
 from nerg_mi.errors import NergError
 from nerg_mi.transport.geometry import Ceiling
 from nerg_mi.viewer.page import Page
@@ -25,7 +26,7 @@ def test01_copied_scene_renders_the_same_picture(store, tmp_path):
     shown = ViewSettings(VIEW, EYE, ("depth", "opacity", "gaze"), 96, 16, 0.05)
     path = tmp_path / "elsewhere" / "view.xml"
     path.parent.mkdir()
-    path.write_text(copy_scene(store, shown))
+    path.write_text(copy_scene(SceneDocument.read(store), shown))
     copy = nerg.Scene.load(path)
     rendered = nerg.render(copy, quantities=["color", "gaze", "depth"])
     assert np.allclose(copy.observer, EYE) and rendered.color.shape == (1, 64, 96, 3)
@@ -44,7 +45,7 @@ def test01_copied_scene_renders_the_same_picture(store, tmp_path):
 
 def test02_copied_scene_has_the_settings(store, tmp_path):
     path = tmp_path / "view.xml"
-    path.write_text(copy_scene(store, ViewSettings(VIEW, EYE, ("depth",), 48, 3, 0.25)))
+    path.write_text(copy_scene(SceneDocument.read(store), ViewSettings(VIEW, EYE, ("depth",), 48, 3, 0.25)))
     scene = nerg.Scene.load(path, view_camera="1, 2, 1.5", view_observer="2, 2, 1.7")
     assert float(np.ravel(np.array(scene.integrator.falloff))[0]) == pytest.approx(0.25)
     assert scene.resolve_sensor(0).sampler().sample_count() == 3 and len(scene.mitsuba.sensors()) == 4
@@ -54,7 +55,7 @@ def test02_copied_scene_has_the_settings(store, tmp_path):
 
 def test03_shapes_without_observer(room, tmp_path):
     path = tmp_path / "view.xml"
-    path.write_text(copy_scene(room, ViewSettings(VIEW, None, ("depth", "visibility"), 48, 1, 0.0)))
+    path.write_text(copy_scene(SceneDocument.read(room), ViewSettings(VIEW, None, ("depth", "visibility"), 48, 1, 0.0)))
     scene = nerg.Scene.load(path)
     assert len(scene.mitsuba.shapes()) == 2 and np.allclose(scene.observer, [0, 0, 0.5])
 
@@ -63,7 +64,7 @@ def test03_shapes_without_observer(room, tmp_path):
 def test04_hidden_ceiling_is_copied(room, tmp_path, up):
     view, up = PinholeView.look_at((1.5, 0, 5), (1.5, 0.01, 0), (0, 0, 1), 0.3, 1.0), np.array(up, float)
     path = tmp_path / "view.xml"
-    path.write_text(copy_scene(room, ViewSettings(view, None, ("depth",), 32, 1, 0.0, (0.5, up))))
+    path.write_text(copy_scene(SceneDocument.read(room), ViewSettings(view, None, ("depth",), 32, 1, 0.0, (0.5, up))))
     rendered = nerg.render(nerg.Scene.load(path), quantities=["depth"]).depth[0]
     steps = refine(nerg.Scene.load(room), view, None, ["depth"], 32, 1, BandPace(), ceiling=Ceiling(0.5, up))
     viewed = [p for p in steps if p is not None][-1].values["depth"]
@@ -72,7 +73,7 @@ def test04_hidden_ceiling_is_copied(room, tmp_path, up):
     assert (np.abs(rendered - viewed) < 0.03).mean() > 0.8 and rendered[16, 16] == pytest.approx(5, abs=0.02)
     # A copy of the copy without a hidden ceiling shows the top again.
     again = tmp_path / "again.xml"
-    again.write_text(copy_scene(path, ViewSettings(view, None, ("depth",), 32, 1, 0.0)))
+    again.write_text(copy_scene(SceneDocument.read(path), ViewSettings(view, None, ("depth",), 32, 1, 0.0)))
     assert nerg.render(nerg.Scene.load(again), quantities=["depth"]).depth[0, 16, 16] == pytest.approx(4, abs=0.02)
 
 
@@ -80,7 +81,7 @@ def test05_scene_without_integrator_is_refused(tmp_path, rgb):
     path = tmp_path / "a.xml"
     path.write_text('<scene version="3.0.0"><shape type="sphere"/></scene>')
     with pytest.raises(NergError, match="0 integrators"):
-        copy_scene(path, ViewSettings(VIEW, None, ("depth",), 48, 1, 0.0))
+        copy_scene(SceneDocument.read(path), ViewSettings(VIEW, None, ("depth",), 48, 1, 0.0))
 
 
 # ---- Participants ----

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import nerg_mi as nerg
-from nerg_mi.environment.nested_scene import replace_gaze
+from nerg_mi.environment.nested_scene import SceneDocument
 from nerg_mi.errors import NergError
 from nerg_mi.formats.boxes import Region
 from nerg_mi.maths.geometry import Similarity
@@ -291,7 +291,7 @@ AT = np.array([0.2, 0.1, 0.6])
 @pytest.fixture
 def scene(room, gaze_fields, tmp_path):
     path = tmp_path / "with.xml"
-    path.write_text(replace_gaze(room, gaze_fields[0]))
+    path.write_text(SceneDocument.read(room).with_gaze(gaze_fields[0]).to_xml())
     return nerg.Scene.load(path)
 
 
