@@ -9,9 +9,10 @@ from typing import Any, cast
 import drjit as dr
 
 from nerg_mi.maths.arrays import log1p
-from nerg_mi.maths.types import Bool, Color, Float, UInt32
+from nerg_mi.maths.types import Bool, Color, Float
 
 from .march_primal import (
+    Hit,
     MarchRequest,
     MarchResult,
     MarchSettings,
@@ -19,14 +20,14 @@ from .march_primal import (
     OcclusionQuery,
     Step,
     StepState,
+    loop_hits,
     march_hits,
     march_primal,
     march_steps,
     optical_depth_limits,
-    position_before,
     zero_sums,
 )
-from .medium import Hits, LastHit, LocalRay, Medium, SampleShader
+from .medium import Hits, LocalRay, Medium, SampleShader
 from .quadrature import absorbed_fraction
 from .splat_lists import SplatLists
 
@@ -252,44 +253,21 @@ class HitMarchOp(MarchOp):
     _primal = staticmethod(march_hits)
 
     def _march_again(self, visit: Callable[..., tuple[Any, Any]], extra: Any) -> Any:
-        f, (t0, t1) = self.request, self.inputs[3:]
-        hits, ray = cast("Hits", f.medium.hits), LocalRay(*(dr.detach(x) for x in self.inputs))
-        Float = type(t0)
-        UInt32: Any = dr.uint32_array_t(Float)
-        end = optical_depth_limits(Float, f.settings, f.until)[1]
-
-        def take(state, t, index, extra):
-            """Process the first hit of the group and shift the others."""
-            state, extra = visit(state, index[0], extra)
-            t, index = t[1:] + [Float(dr.inf)], index[1:] + [UInt32(0)]
-            return replace(state, active=state.active & (t[0] < dr.inf)), t, index, extra
-
-        def group(active, last, state, extra):
-            near = hits.find_next(ray, last, t1, dr.exp(-state.tau), dr.exp(-end), active)
-            farthest = LastHit(near.t[-1], near.index[-1])
-            state = replace(state, active=active & (near.t[0] < dr.inf))
-            state, _, _, extra = dr.while_loop(
-                (state, near.t, near.index, extra), lambda state, *_: state.active, take, label="hits again"
-            )
-            return active & (farthest.t < dr.inf) & (state.tau < end), farthest, state, extra
-
-        color = None if f.color is None else f.color.zero()
-        state = _Replay(**zero_sums(Float), active=f.active, color=color)
-        first = position_before(t0)
+        f, (t0, t1), ray = self.request, self.inputs[3:], LocalRay(*(dr.detach(x) for x in self.inputs))
+        start = _Replay(**zero_sums(type(t0)), active=f.active, color=None if f.color is None else f.color.zero())
         with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, True):
-            out = dr.while_loop((f.active, first, state, extra), lambda active, *_: active, group, label="hits adjoint")
-        return out[3]
+            return loop_hits(ray, t0, t1, f, start, visit, extra)[1]
 
-    def _replay(self, leaves: list[Any], state: Any, place: UInt32) -> tuple[ReplayStep, Any]:
+    def _replay(self, leaves: list[Any], state: Any, place: Hit) -> tuple[ReplayStep, Any]:
         medium, active = self.request.medium, state.active
         o, d, w, t0, t1 = leaves
-        t, absorbed = cast("Hits", medium.hits).reevaluate(LocalRay(o, d, w, t0, t1), place, active)
+        t, absorbed = cast("Hits", medium.hits).reevaluate(LocalRay(o, d, w, t0, t1), place.index, active)
         return self._absorb(
             state,
             dr.select(active, -log1p(-absorbed), 0),
             dr.select(active, dr.detach(absorbed), 0),
             t - t0,
-            lambda painter, lit: painter.shade(medium, [cast("Float", place)], o + d * t, w, lit),
+            lambda painter, lit: painter.shade(medium, [cast("Float", place.index)], o + d * t, w, lit),
             lambda missing: t,
         )
 

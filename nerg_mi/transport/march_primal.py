@@ -595,42 +595,77 @@ def optical_depth_limits(Float: type, settings: MarchSettings, until: Float | fl
 
 
 @dataclass
-class _Hits:
-    """Remaining hits of a group."""
+class Hit:
+    """A hit of each ray: its distance, the fraction of the arriving light that it absorbs, and its element."""
+
+    t: Float
+    absorbed: Float
+    index: UInt32
+
+
+@dataclass
+class _PrimalHits:
+    """Loop state of `march_hits`."""
 
     active: Bool
-    t: list[Float]
-    absorbed: list[Float]
-    index: list[UInt32]
     result: MarchResult
 
+    @property
+    def tau(self) -> Float:
+        """Optical depth so far."""
+        return self.result.tau
 
-def position_before(t0: Float) -> LastHit:
-    """Position behind which the first hits are searched, which includes a hit at ``t0`` itself."""
-    UInt32: Any = dr.uint32_array_t(type(t0))
-    return LastHit(dr.fma(dr.abs(t0), -(2.0**-22), t0 - 1e-37), UInt32(0))
+
+def loop_hits(
+    ray: LocalRay, t0: Float, t1: Float, request: MarchRequest, start: Any, visit: Callable[..., Any], extra: Any
+) -> tuple[Any, Any, Float | None]:
+    """Loop over the hits of ``ray`` from ``t0`` to ``t1``, of the march and of its derivatives.
+
+    ``visit(state, hit, extra)`` processes a hit and returns the state, on whose ``active`` lanes the march goes on, and
+    ``extra``. Returns both at the end, and the number of density evaluations if it is counted.
+    """
+    Float, hits = type(t0), cast("Hits", request.medium.hits)
+    UInt32: Any = dr.uint32_array_t(Float)
+    stop = dr.exp(-optical_depth_limits(Float, request.settings, request.until)[1])
+
+    def take(here: Bool, group: list[Hit], state: Any, extra: Any) -> tuple[Bool, list[Hit], Any, Any]:
+        """Process the first hit of the group and shift the others."""
+        state, extra = visit(replace(state, active=here), group[0], extra)
+        group = [*group[1:], Hit(Float(dr.inf), Float(0), UInt32(0))]
+        return state.active & (group[0].t < dr.inf), group, state, extra
+
+    def find_group(last: LastHit, state: Any, extra: Any, evals: Any) -> tuple[LastHit, Any, Any, Any]:
+        """Find the next group of hits and process it."""
+        near = hits.find_next(ray, last, t1, dr.exp(-state.tau), stop, state.active)
+        last = LastHit(near.t[-1], near.index[-1])
+        group = list(map(Hit, near.t, near.absorbed, near.index))
+        first = state.active & (near.t[0] < dr.inf), group, state, extra
+        _, _, state, extra = dr.while_loop(first, lambda here, *_: here, take, label="hits")
+        evals = None if evals is None else evals + near.evals
+        return last, replace(state, active=state.active & (last.t < dr.inf)), extra, evals
+
+    # A hit at t0 itself is included.
+    before = LastHit(dr.fma(dr.abs(t0), -(2.0**-22), t0 - 1e-37), UInt32(0))
+    first = before, start, extra, Float(0) if request.count else None
+    return dr.while_loop(first, lambda last, state, *_: state.active, find_group, label="groups of hits")[1:]
 
 
 def march_hits(ray: LocalRay, t0: Float, t1: Float, request: MarchRequest) -> MarchResult:
     """March ``ray`` through the hits of the medium from ``t0`` to ``t1``, without derivatives."""
     Float, medium, color, occlusion = type(t0), request.medium, request.color, request.occlusion
-    UInt32: Any = dr.uint32_array_t(Float)
     goal, end = optical_depth_limits(Float, request.settings, request.until)
-    hits, stop = cast("Hits", medium.hits), dr.exp(-end)
 
-    def shade_hit(state: _Hits) -> tuple[_Hits]:
-        """Process the first hit of the group and shift the others."""
-        active, result, t, index = state.active, replace(state.result), state.t[0], state.index[0]
-        tau = result.tau
+    def visit(state: _PrimalHits, hit: Hit, _: None) -> tuple[_PrimalHits, None]:
+        active, result, t, tau = state.active, replace(state.result), hit.t, state.tau
         if occlusion is not None:
             active = result.record_decided(occlusion.is_clear(t, tau), active)
-        absorbed = dr.select(active, state.absorbed[0], 0)
+        absorbed = dr.select(active, hit.absorbed, 0)
         result, weight, crosses = result.absorb(active, -log1p(-absorbed), absorbed, t - t0, goal)
         result.record_crossing(crosses, t, Float(0), t, tau)
         if color is not None:
             painter, lit = color, active & (weight > 0)
             result.color = result.color + weight * dr.if_stmt(
-                (lit, index),
+                (lit, hit.index),
                 lit,
                 lambda lit, index: painter.shade(medium, [cast("Float", index)], ray.o + ray.d * t, ray.w, lit),
                 lambda lit, index: painter.zero(),
@@ -640,20 +675,8 @@ def march_hits(ray: LocalRay, t0: Float, t1: Float, request: MarchRequest) -> Ma
                 result.color_evals = result.color_evals + dr.select(lit, 1, 0)
         if occlusion is not None:
             active = result.record_decided(occlusion.is_hidden(t, result.tau), active)
-        remaining = state.t[1:] + [Float(dr.inf)], state.absorbed[1:] + [Float(0)], state.index[1:] + [UInt32(0)]
-        return (_Hits(active & (result.tau < end) & (remaining[0][0] < dr.inf), *remaining, result),)
+        return _PrimalHits(active & (result.tau < end), result), None
 
-    def group(active: Bool, last: LastHit, result: MarchResult) -> tuple[Bool, LastHit, MarchResult]:
-        """Find the next group of hits and process it."""
-        near, result = hits.find_next(ray, last, t1, dr.exp(-result.tau), stop, active), replace(result)
-        if result.density_evals is not None:
-            result.density_evals = result.density_evals + near.evals
-        farthest = LastHit(near.t[-1], near.index[-1])
-        start = _Hits(active & (near.t[0] < dr.inf), near.t, near.absorbed, near.index, result)
-        (state,) = dr.while_loop((start,), lambda state: state.active, shade_hit, label="hits")
-        result = state.result
-        active = active & (farthest.t < dr.inf) & (result.tau < end)
-        return active if result.decided is None else active & ~result.decided, farthest, result
-
-    start = request.active, position_before(t0), request.init_result(Float)
-    return dr.while_loop(start, lambda active, *_: active, group, label="groups of hits")[2]
+    start = _PrimalHits(request.active, request.init_result(Float))
+    state, _, density_evals = loop_hits(ray, t0, t1, request, start, visit, None)
+    return replace(state.result, density_evals=density_evals)
