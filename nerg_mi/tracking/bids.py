@@ -110,7 +110,8 @@ def write_bids(
     columns = _list_columns(rays)
     with create_folder_atomically(folder) as root:
         files = []
-        write_json(root / DESCRIPTION, _describe_dataset(name, provenance))
+        generated = {} if provenance is None else {"GeneratedBy": [dict(provenance)]}
+        write_json(root / DESCRIPTION, {"Name": name, "BIDSVersion": VERSION, "DatasetType": "raw", **generated})
         write_text(root / "README", _README)
         _write_participants(root, rays, labels)
         write_json(root / f"task-{task}_physio.json", _describe_gaze(rays, task, columns))
@@ -266,11 +267,6 @@ _SYSTEM = (
     "direction_x, direction_y, direction_z; x_coordinate, y_coordinate, z_coordinate are the point in {units} where it "
     "meets a surface. They are not pixels of a screen or of a picture."
 )
-
-
-def _describe_dataset(name: str, provenance: Mapping[str, Any] | None) -> dict[str, Any]:
-    generated = {} if provenance is None else {"GeneratedBy": [dict(provenance)]}
-    return {"Name": name, "BIDSVersion": VERSION, "DatasetType": "raw", **generated}
 
 
 def _describe_gaze(rays: Rays, task: str, columns: Iterable[str]) -> dict[str, Any]:

@@ -297,19 +297,13 @@ def _is_number(value: object) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def _is_point(value: object) -> bool:
-    return isinstance(value, list) and len(value) == 3 and all(map(_is_number, value))
-
-
-def _is_counts(value: object) -> bool:
-    return isinstance(value, dict) and all(map(is_count, value.values()))
-
-
 _SOURCE_CHECKS: dict[str, tuple[Callable[[Any], bool], str]] = {
     **dict.fromkeys(("file", "where", "recipe"), (_is_text, "text")),
     "stamp": (lambda value: value is None or _is_text(value), "text"),
     "generation": (is_count, "a count"),
-    **dict.fromkeys(("persons", "cohorts"), (_is_counts, "counts")),
+    **dict.fromkeys(
+        ("persons", "cohorts"), (lambda value: isinstance(value, dict) and all(map(is_count, value.values())), "counts")
+    ),
     "metadata": (lambda value: isinstance(value, dict), "an object"),
     "parts": (lambda value: isinstance(value, list) and all(isinstance(v, dict) for v in value), "a list of parts"),
 }
@@ -317,7 +311,10 @@ _PART_CHECKS: dict[str, tuple[Callable[[Any], bool], str]] = {
     **dict.fromkeys(("bucket", "number", "rays", "bytes", "duplicates", "hits"), (is_count, "a count")),
     **dict.fromkeys(("cohorts", "heads"), (lambda value: isinstance(value, bool), "a boolean")),
     **dict.fromkeys(("start", "end", "recorded"), (_is_number, "a number")),
-    **dict.fromkeys(("low", "high"), (_is_point, "a point")),
+    **dict.fromkeys(
+        ("low", "high"),
+        (lambda value: isinstance(value, list) and len(value) == 3 and all(map(_is_number, value)), "a point"),
+    ),
     **dict.fromkeys(("place", "day", "first", "last"), (_is_text, "text")),
 }
 """Validation of each value of a manifest: a predicate, and the name of the type for messages."""

@@ -122,10 +122,6 @@ ROLES = ("time", "participant", "origin", "direction", "hit", "head", "confidenc
 _REQUIRED = ("time", "origin", "direction")
 
 
-def _default_columns(role: str) -> list[str]:
-    return [f"{role}_{axis}" for axis in "xyz"] if role in _VECTORS else [role]
-
-
 def _read_vectors(reader: DataFrameReader, names: Sequence[Any]) -> np.ndarray:
     """Read vectors (N, 3) from three columns, or from one whose cells are sequences, mappings of axes, or text such as
     (1, 2, 3)."""
@@ -162,7 +158,7 @@ def from_dataframe(
     as_list = lambda role, names: [names] if is_one(role, names) else list(names)
     example = '{"origin": ["x", "y", "z"], "direction": ["dx", "dy", "dz"], "time": "t"}'
     if columns is None:
-        defaults = {role: _default_columns(role) for role in ROLES}
+        defaults = {role: [f"{role}_{axis}" for axis in "xyz"] if role in _VECTORS else [role] for role in ROLES}
         if missing := [name for role in _REQUIRED for name in defaults[role] if name not in reader.names]:
             raise NergError(
                 f'the data frame has no column "{missing[0]}"; name those that it has '

@@ -724,10 +724,6 @@ class Rays:
         """
         return _import("in_memory").to_dataframe(self, library)
 
-    def to_arrow(self) -> Any:
-        """Return a ``pyarrow.Table`` with the columns of `to_dataframe`. Raises `NergError` without pyarrow."""
-        return self.to_dataframe("pyarrow")
-
     def columns(self) -> dict[str, np.ndarray]:
         """Arrays with one row per ray, by name, without absent ones."""
         return {name: column for name in COLUMNS if (column := getattr(self, name)) is not None}

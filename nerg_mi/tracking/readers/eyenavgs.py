@@ -191,7 +191,8 @@ READERS = (EyeNavGS(),)
 def _add_recording(path: Path, setting: SceneSetting, options: EyeNavGSOptions, builder: RaysBuilder) -> str | None:
     """Add a recording's rows; returns why all were dropped, or None."""
     fault = _find_fault(path, ignores_bad_lines=builder.on_bad_line is not None)
-    time = _find_time_column(path)
+    columns = read_table_columns(path)
+    time = next((name for name in _TIMES if name in columns), _TIMES[0])
     builder.begin_source(path)
     for v, is_paired, lines in _pair_rows(builder.read_table(path, [*_COLUMNS, time])):
         eye_positions = setting.to_play_area(v[:, :, 1:4].reshape(-1, 3)).reshape(-1, 2, 3)
@@ -315,9 +316,3 @@ def _find_place_setting(path: Path, settings: dict[str, SceneSetting], settings_
             f'{path} is of "{sanitize(place, 40)}", which is not in {settings_path} (it has {available}); rename it'
         )
     return settings[place]
-
-
-def _find_time_column(path: Path) -> str:
-    """Name of the column of times, which differs between the sites."""
-    columns = read_table_columns(path)
-    return next((name for name in _TIMES if name in columns), _TIMES[0])

@@ -239,12 +239,9 @@ def _parse_rows(
     values = values.reshape(len(ids), *layout)
     points, confidence = values[:, :, :3], values[:, :, 3] if layout.width == 4 else np.ones(values.shape[:2])
     points[np.isfinite(find_fill_values(points)) | ~(confidence > 0)] = np.nan
-    return SkeletonRows(np.array(ids, dtype=str), _to_array(times), points, np.array(lines, dtype=np.int64), confidence)
-
-
-def _to_array(times: list[float]) -> np.ndarray:
-    """Integers keep all their digits."""
-    return np.array(times, dtype=np.int64 if all(isinstance(time, int) for time in times) else np.float64)
+    # Integers keep all their digits.
+    ticks = np.array(times, dtype=np.int64 if all(isinstance(time, int) for time in times) else np.float64)
+    return SkeletonRows(np.array(ids, dtype=str), ticks, points, np.array(lines, dtype=np.int64), confidence)
 
 
 def _parse_numbers(texts: list[str], columns: list[int], pick: operator.itemgetter, has_all: bool) -> np.ndarray:
