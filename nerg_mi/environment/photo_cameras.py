@@ -11,7 +11,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError, parameter, sanitize
 from nerg_mi.maths.transforms import invert_similarity
-from nerg_mi.photos.images import read_photo
+from nerg_mi.photos.images import get_photo_size
 from nerg_mi.photos.photo_set import Photos
 from nerg_mi.photos.posed import PosedFrame
 
@@ -59,20 +59,13 @@ def _posed(photos: Path, provenance: Mapping[str, Any], allow_outside: bool) -> 
 
 
 def _camera(frame: PosedFrame) -> PhotoCamera:
-    lens = frame.lens
-    size = (round(lens["w"]), round(lens["h"])) if "w" in lens and "h" in lens else _size(frame)
-    i = frame.intrinsics(*size)
+    i = frame.intrinsics(*get_photo_size(frame))
     origin = frame.to_world[:3, 3]
     # OpenGL cameras look along -z, y up.
     ahead, up = -frame.to_world[:3, 2], frame.to_world[:3, 1]
     offset = (float(0.5 - i.cx / i.width), float(0.5 - i.cy / i.height))
     taken = Lens(float(np.degrees(2 * np.arctan(i.width / (2 * i.fx)))), i.width / i.height, offset)
     return PhotoCamera(frame.name, LookAt(origin, origin + ahead, up), taken, i.is_distorted)
-
-
-def _size(frame: PosedFrame) -> tuple[int, int]:
-    height, width = read_photo(frame).shape[:2]
-    return width, height
 
 
 def _frame(posed: Photos, photo: str) -> PosedFrame:

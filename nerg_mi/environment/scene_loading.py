@@ -77,11 +77,6 @@ def check_scene_file(path: str | Path, defaults: Mapping[str, str] | None = None
     _SceneFileChecker(path.parent, {k: str(v) for k, v in (defaults or {}).items()}).check(path)
 
 
-def _check_scene_text(text: str, defaults: Mapping[str, str]) -> None:
-    """Check a scene file in memory, as `check_scene_file`."""
-    _SceneFileChecker(Path(), dict(defaults)).check(Path("scene in memory"), text.encode())
-
-
 def list_scene_files(path: str | Path, defaults: Mapping[str, str] | None = None) -> list[Path]:
     """List a scene file and the existing files that it names: includes, meshes, fields and textures.
 
@@ -430,7 +425,7 @@ def load_scene_text(text: str, defaults: Mapping[str, str], volumes: Mapping[str
     """
     import mitsuba as mi
 
-    _check_scene_text(text, defaults)
+    _SceneFileChecker(Path(), dict(defaults)).check(Path("scene in memory"), text.encode())
     parser: Any = mi.parser
     values: dict[str, Any] = dict(defaults)
     with translate_mitsuba_errors(), ensure_two_threads():

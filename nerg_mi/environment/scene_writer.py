@@ -417,6 +417,7 @@ class _SceneNames:
 def _make_nodes(scene: SceneText, folder: Path | None) -> Sequence[Node]:
     names, content = _SceneNames(scene.content.reserved_names), scene.content
     paths = dict.fromkeys(relative_path(path, folder) for path in content.folders)
+    pose = _make_look_at(names.use("camera"), names.use("target"), _format_up(scene.camera, names))
     return [
         *(element("path", value=check_attribute(path)) for path in paths if path != "."),
         *content.preamble,
@@ -424,7 +425,7 @@ def _make_nodes(scene: SceneText, folder: Path | None) -> Sequence[Node]:
         BlankLine(),
         _make_integrator(scene, names),
         BlankLine(),
-        _make_camera(scene, names),
+        _make_perspective("camera", pose, scene, names, scene.lens.offset),
         BlankLine(),
         *_make_observer_sensors(scene, names),
         *([BlankLine(), *content.scene_children] if content.scene_children else []),
@@ -494,11 +495,6 @@ def _make_integrator(scene: SceneText, names: _SceneNames) -> Element:
     for name in INTEGRATOR_SETTINGS:
         children.append(prop(kinds.get(name, "string"), name, names.use(name)))
     return element("integrator", *children, type="nerg", id=names("integrator"))
-
-
-def _make_camera(scene: SceneText, names: _SceneNames) -> Element:
-    pose = _make_look_at(names.use("camera"), names.use("target"), _format_up(scene.camera, names))
-    return _make_perspective("camera", pose, scene, names, scene.lens.offset)
 
 
 def _make_observer_sensors(scene: SceneText, names: _SceneNames) -> list[Node]:

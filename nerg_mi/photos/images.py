@@ -118,6 +118,14 @@ def read_image(path: str | Path) -> np.ndarray:
     return np.clip(out, 0, 1)
 
 
+def get_photo_size(frame: PosedFrame) -> tuple[int, int]:
+    """Return width and height from the camera, or otherwise from the file."""
+    if "w" in frame.lens and "h" in frame.lens:
+        return round(frame.lens["w"]), round(frame.lens["h"])
+    height, width = read_photo(frame).shape[:2]
+    return width, height
+
+
 def read_photo(frame: PosedFrame) -> np.ndarray:
     """Read the pixels of a photo in the orientation that the camera of ``frame`` describes.
 
@@ -655,7 +663,7 @@ def undistort_photo(view: PhotoView) -> UndistortedPhoto:
     """
     i = view.camera.intrinsics
     color = view.color
-    photo_mask = _get_mask(view)
+    photo_mask = np.ones(view.shape, bool) if view.mask is None else view.mask
     if not i.is_distorted and abs(i.fx / i.fy - 1) < 1e-9:
         return UndistortedPhoto(color, photo_mask, make_sensor_dict(view.camera))
     focal = float(np.sqrt(i.fx * i.fy))
@@ -727,10 +735,6 @@ def apply_lens(picture: np.ndarray, source: PosedCamera, camera: PosedCamera) ->
 def _compute_directions(intrinsics: Intrinsics) -> np.ndarray:
     """Return the directions (h, w, 3) of the pixels in OpenCV's camera frame."""
     return cameras.image_to_directions(pixel_grid(intrinsics), intrinsics)
-
-
-def _get_mask(view: PhotoView) -> np.ndarray:
-    return np.ones(view.shape, bool) if view.mask is None else view.mask
 
 
 def _check_unfolded(pixels: np.ndarray, pinhole: Intrinsics, i: Intrinsics, inside: np.ndarray) -> np.ndarray:

@@ -295,7 +295,9 @@ class PosedImages:
 
     def transform(self: AnyImages, similarity: np.ndarray) -> AnyImages:
         """Transform to other coordinates by ``similarity`` (4, 4): a uniform scale, a rotation and a translation."""
-        scale, rotation = _split_similarity(similarity)
+        m = check_rigid_transforms(similarity, "the transform of coordinates", may_scale=True)
+        scale = float(np.cbrt(np.linalg.det(m[:3, :3])))
+        rotation = m[:3, :3] / scale
         back = np.linalg.inv(similarity)
         frames = []
         for f in self.frames:
@@ -313,13 +315,6 @@ class PosedImages:
             to_original=None if self.to_original is None else self.to_original @ back,
             to_file=self.to_file @ back,
         )
-
-
-def _split_similarity(similarity: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return scale and rotation of a similarity. Raises `NergError` for another matrix."""
-    m = check_rigid_transforms(similarity, "the transform of coordinates", may_scale=True)
-    scale = float(np.cbrt(np.linalg.det(m[:3, :3])))
-    return scale, m[:3, :3] / scale
 
 
 def _transform_box(box: np.ndarray | None, m: np.ndarray) -> np.ndarray | None:

@@ -18,7 +18,7 @@ from nerg_mi.maths.transforms import invert_similarity
 
 from . import cameras
 from .cameras import Intrinsics, PosedCamera, make_area_weights, resize_by_area, resize_mask, resize_nearest
-from .images import open_bitmap, read_mask, read_photo
+from .images import get_photo_size, open_bitmap, read_mask, read_photo
 from .photo_set import Photos
 from .posed import MaskFile, PosedFrame, check_inside, describe_unused
 
@@ -401,7 +401,7 @@ def _make_view(frame: PosedFrame, path: Path | None, model, per: str) -> Salienc
             raise NergError(f'the photo "{frame.image}" has no saliency: {e}') from e
         subject = f'the photo "{frame.image}"'
     else:
-        values, size, subject = read_salience(path), _get_photo_size(frame), f'the salience image "{path}"'
+        values, size, subject = read_salience(path), get_photo_size(frame), f'the salience image "{path}"'
     h, w = values.shape
     # The size of a map may have been rounded to a pixel.
     if abs(h - w * size[1] / size[0]) > max(1.0, _SHAPE_TOLERANCE * h):
@@ -431,13 +431,6 @@ def _to_opaque_float(photo: np.ndarray) -> np.ndarray:
     """Convert to floats in 0..1, composited over black."""
     photo = photo if photo.dtype == np.float32 else photo.astype(np.float32) / np.iinfo(photo.dtype).max
     return photo if photo.shape[2] == 3 else photo[..., :3] * photo[..., 3:]
-
-
-def _get_photo_size(frame: PosedFrame) -> tuple[int, int]:
-    """Return width and height from the camera, or otherwise from the file."""
-    if "w" in frame.lens and "h" in frame.lens:
-        return round(frame.lens["w"]), round(frame.lens["h"])
-    return read_photo(frame).shape[1::-1]
 
 
 def _resize_frame_mask(frame: PosedFrame, file: MaskFile, intrinsics: Intrinsics) -> np.ndarray:
