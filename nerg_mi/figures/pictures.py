@@ -168,7 +168,8 @@ def render(
     activate_mitsuba()
     requested = resolve_quantities(scene, quantities)
     sensor = scene.resolve_sensor(camera)
-    _check_counts(spp, seed)
+    check_number(spp, Range(0, SPP.high), "spp", is_integer=True)
+    check_number(seed, SEEDS, "seed", is_integer=True)
     with open_reporter(progress) as reporter, translate_mitsuba_errors():
         context = make_aov_context(scene, requested)
         positions = _resolve_observers(scene, sensor, observers, bool(context.observer_aovs))
@@ -294,8 +295,3 @@ def _has_alpha(film: Any) -> bool:
     import mitsuba as mi
 
     return bool(mi.has_flag(film.flags(), mi.FilmFlags.Alpha))
-
-
-def _check_counts(spp: int, seed: int) -> None:
-    check_number(spp, Range(0, SPP.high), "spp", is_integer=True)
-    check_number(seed, SEEDS, "seed", is_integer=True)

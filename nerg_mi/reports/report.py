@@ -276,7 +276,9 @@ class ReportBuilder:
         views = self._views(scene, rendered)
         environment = self._environment(scene)
         sampler = make_report_sampler(self.field, environment, self.training.get("probes", {}).get("depth", "median"))
-        viewpoints = self._viewpoints(environment, scene)
+        viewpoints = self._observer(scene)
+        if self.rays is not None:
+            viewpoints = sample_eye_positions(self.rays, environment, settings.viewpoints)
         # The observer was reported with the scene.
         if not sampler.describe_extrapolation(self._observer(scene).positions):
             if sentence := sampler.describe_extrapolation(viewpoints.positions):
@@ -401,12 +403,6 @@ class ReportBuilder:
         loaded = scene.load(radiance="false", aovs="opacity")
         geometry = SceneGeometry(loaded.integrator().medium, loaded)
         return Environment(geometry, self.field.box, scene.shown.environment.kind, align=self.align)
-
-    def _viewpoints(self, environment: Environment, scene: PlacedScene) -> EyePositions:
-        """Return recorded positions, or that of the observer."""
-        if self.rays is not None:
-            return sample_eye_positions(self.rays, environment, self.settings.viewpoints)
-        return self._observer(scene)
 
     def _observer(self, scene: PlacedScene) -> EyePositions:
         at = scene.text.camera if scene.text.observer is None else scene.text.observer

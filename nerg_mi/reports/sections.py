@@ -668,7 +668,9 @@ SECTIONS: tuple[Section, ...] = (
 
 def render_page(run: Run) -> str:
     """Return the HTML document of ``run``; equal runs give equal text."""
-    style, script = (_read_asset(name) for name in ("style.css", "viewer.js"))
+    style, script = (
+        (files("nerg_mi.reports") / name).read_text(encoding="utf-8") for name in ("style.css", "viewer.js")
+    )
     scripts = [script] if run.stage is not None else []
     policy = "; ".join(
         [
@@ -705,10 +707,6 @@ def _render_section(section, run: Run) -> Html:
     absent = section.reason_absent(run)
     body = paragraph(absent, kind="absent") if absent else section.render(run)
     return element("section", element("h2", section.title), body, id=section.name)
-
-
-def _read_asset(name: str) -> str:
-    return files("nerg_mi.reports").joinpath(name).read_text(encoding="utf-8")
 
 
 def _csp_hash(text: str) -> str:
