@@ -251,7 +251,9 @@ def surface_from_traces(traces: SceneTraces, num_voxels: int = NUM_VOXELS) -> Sc
     start, segment, length = traces.start[is_valid], (traces.end - traces.start)[is_valid], length[is_valid]
     for t in np.arange(0, min(length.max(initial=0), float(np.linalg.norm(box[1] - box[0]))), 0.8 * step):
         is_inside = length - 0.7 * step > t
-        _mark_voxels(free, start[is_inside] + segment[is_inside] * (t / length[is_inside, None]), lower, step)
+        points = start[is_inside] + segment[is_inside] * (t / length[is_inside, None])
+        index = np.floor((points - lower) / step).astype(int)
+        free[tuple(index[((index >= 0) & (index < shape)).all(axis=1)].T)] = True
     # Close gaps of one voxel between rays.
     free = np.asarray(binary_dilation(free), bool) & ~solid
     return _make_surface(means, solid, _remove_pockets(free), lower, step, True)
@@ -285,12 +287,6 @@ def _make_lattice(low: np.ndarray, high: np.ndarray, voxels: int) -> tuple[np.nd
     step = max(float(np.cbrt(np.prod(size) / voxels)), float(size.max()) / 512)
     shape = np.ceil(size / step).astype(int) + 2 * _PADDING
     return low - _PADDING * step, step, (int(shape[0]), int(shape[1]), int(shape[2]))
-
-
-def _mark_voxels(out: np.ndarray, points: np.ndarray, lower: np.ndarray, step: float) -> None:
-    index = np.floor((points - lower) / step).astype(int)
-    inside = ((index >= 0) & (index < out.shape)).all(axis=1)
-    out[tuple(index[inside].T)] = True
 
 
 def _fill_voxels(points: np.ndarray, lower: np.ndarray, step: float, shape) -> tuple[np.ndarray, np.ndarray]:

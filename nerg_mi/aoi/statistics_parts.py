@@ -219,7 +219,10 @@ class PartitionedStatistics:
             parts = []
             if isinstance(rays, RayDataset):
                 data = rays.require_single_place()
-                for (source, part), group in _group_parts(data):
+                # Consecutive parts whose sessions `iter_blocks` may join.
+                for _, parts_of_sessions in groupby(data.parts, key=lambda p: (p[0].id, p[1].day, p[1].bucket)):
+                    group = list(parts_of_sessions)
+                    source, part = group[0]
                     files = [data.folder / DATASET_MANIFEST, source_manifest_path(data.folder, source.id)]
                     files += [data.folder / p.path(source.id) for _, p in group]
                     value = DatasetPart(
@@ -299,13 +302,6 @@ def _drop_unused(block: Rays) -> Rays:
         persons=tuple(block.persons[k] for k in used.tolist()),
         metadata={"frame": block.metadata["frame"]},
     )
-
-
-def _group_parts(data: RayDataset) -> Iterator[tuple]:
-    """Yield groups of consecutive dataset parts whose sessions `iter_blocks` may join, each with its first part."""
-    for _, group in groupby(data.parts, key=lambda p: (p[0].id, p[1].day, p[1].bucket)):
-        parts = list(group)
-        yield parts[0], parts
 
 
 def _geometry_files(gaze: Path) -> list[Path]:

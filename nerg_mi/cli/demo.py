@@ -207,7 +207,9 @@ def _render_demo(
     clock.start("surfaces")
     eye = tuple(float(v) for v in np.ravel(np.array(sensor_center(seen.sensors()[FIRST_PERSON]))))
     if (scene.parent / TWIN).is_file():
-        files.append(_bake(scene.parent / TWIN, inputs[2], eye, output / "heatmap.glb", seed))
+        coarse = BakeSampling(max_angle=5.0)
+        baked = bake(scene.parent / TWIN, gaze=inputs[2], observer=eye, max_edge=0.2, sampling=coarse, seed=seed)
+        files.append(baked.save(output / "heatmap.glb"))
     clock.start("tracked gaze")
     tracked = []
     if scene == SCENE_FILE and inputs[2] == scene.parent / CHECKPOINTS["gaze"]:
@@ -297,12 +299,6 @@ def write_recording(path: Path) -> Path:
     """Write the store's sample of recorded gaze to the rays file ``path``."""
     write_bytes(path, (SCENE_FILE.parent / TRACKED).read_bytes())
     return path
-
-
-def _bake(twin: Path, gaze: Path, eye: tuple[float, ...], output: Path, seed: int) -> Path:
-    """Bake the gaze of the observer at ``eye`` onto the mesh ``twin`` at a coarse resolution, and write ``output``."""
-    coarse = BakeSampling(max_angle=5.0)
-    return bake(twin, gaze=gaze, observer=eye, max_edge=0.2, sampling=coarse, seed=seed).save(output)
 
 
 def _camera_of(sensor) -> dict:

@@ -197,11 +197,6 @@ def _describe(scene: ExchangeScene) -> str:
     return ", ".join(f"{count:,} {one if count == 1 else several}" for (one, several), count in counts.items() if count)
 
 
-def _unwrap(item: Any) -> Any:
-    """Return what an environment with surfaces was opened from; other items as they are."""
-    return item.input if isinstance(item, Environment) and item.has_surfaces else item
-
-
 class _Builder:
     """Collects the contents of a scene in ``scene``."""
 
@@ -216,7 +211,7 @@ class _Builder:
             self._add_meshes(ExchangeMesh(name, mesh.vertices, mesh.faces, colors, item.density, item.content.unit))
             return
         item = item.splats if isinstance(item, SplatBake) else item
-        item = _unwrap(item)
+        item = item.input if isinstance(item, Environment) and item.has_surfaces else item
         role = find_role(item)
         if role == "rays":
             self._add_rays(open_rays(item), name)
