@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -224,16 +223,13 @@ class KernelMixture:
         """Evaluate the densities (P, D) of positions (P, 3) in unit directions (D, 3) or (P, D, 3)."""
         positions, directions = np.atleast_2d(np.asarray(positions, np.float64)), np.asarray(directions)
         density = self._prior_weight * np.asarray(self._prior(positions, directions))
+        ns = namespace(get_default_backend())
         for start in range(0, len(positions), _BLOCK):
             rows = slice(start, start + _BLOCK)
             d = directions if directions.ndim == 2 else directions[rows]
             for part in self._parts:
-                density[rows] += part.weight * part.observe(positions[rows], _get_backend()).evaluate(d)
+                density[rows] += part.weight * part.observe(positions[rows], ns).evaluate(d)
         return density
-
-
-def _get_backend() -> ModuleType:
-    return namespace(get_default_backend())
 
 
 def _make_kernels(rays: Rays, is_aimed: bool, weights: Sequence[float]) -> ReaimedHits | None:
