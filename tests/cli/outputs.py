@@ -52,7 +52,7 @@ STATS += "aois.png transitions.png "
 STATS += "about.json"
 if has_parquet():
     STATS += " aois.parquet transitions.parquet durations.parquet participants.parquet"
-GAZE = "--radius 0.6 --steps 2 --min-rays 8 --seed 1"
+GAZE = "--radius 0.6 --steps 2 --min-rays 8 --seed 1 --prior-folds 1"
 
 
 @dataclass(frozen=True)

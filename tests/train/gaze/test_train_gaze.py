@@ -37,6 +37,7 @@ from tests.train.gaze.looks import BOX, RAYS, looking_at
 
 
 QUICK = {"radius": 0.5, "probes": 6, "min_rays": 8, "steps": 3, "directions": 64, "validation_zones": 0}
+FOLDED = {**QUICK, "prior_folds": 1}  # more folds take long
 WALL = """<scene version="3.0.0"><shape type="rectangle"><transform name="to_world">
     <scale value="2"/><lookat origin="1.5, 0, 1.5" target="0, 0, 1.5" up="0, 0, 1"/></transform></shape></scene>"""
 
@@ -89,7 +90,8 @@ def arrays(field):
 def test_a_training_returns_the_field_and_reports_progress(rays):
     """The rays are in memory; no file is read or written."""
     heard = Listener()
-    result = train_gaze(rays.with_tracking("head"), "none", **QUICK, variant="capture", progress=heard)
+    options = {**QUICK, "prior_folds": 2, "variant": "capture"}
+    result = train_gaze(rays.with_tracking("head"), "none", **options, progress=heard)
     assert result.path is None and result.network.config.geometry == "none"
     provenance = result.provenance
     assert provenance["recipe"] == "default" and provenance["steps"] == 3 and provenance["geometry"] == "none"
@@ -113,7 +115,7 @@ def test_a_training_returns_the_field_and_reports_progress(rays):
 def test_without_geometry_folds_select_the_variant(rays):
     """Folds run before the fit; their choice is reported and trained."""
     heard = Listener()
-    result = train_gaze(rays, "none", **QUICK, progress=heard)
+    result = train_gaze(rays, "none", **{**QUICK, "prior_folds": 2}, progress=heard)
     assert heard.shares == sorted(heard.shares) and heard.shares[-1] == pytest.approx(1)
     mix = result.provenance["mix"]
     assert set(mix["variants"]) == {"capture", "emit_capture"} and mix["variant"] == result.network.config.variant
@@ -126,7 +128,7 @@ def test_without_geometry_folds_select_the_variant(rays):
     assert any(m.endswith(f"these samples chose the variant {mix['variant']} and the weights") for m in heard.messages)
     # Without folds the variant is not selected.
     heard = Listener()
-    result = train_gaze(rays, "none", **QUICK, prior_folds=0, progress=heard)
+    result = train_gaze(rays, "none", **{**QUICK, "prior_folds": 0}, progress=heard)
     assert result.network.config.variant == "capture" and "mix" not in result.provenance
     assert heard.messages[0] == "there is no geometry: capture alone is trained"
 
@@ -211,7 +213,7 @@ def test_a_registered_recipe_trains_from_function_and_command(rays, tmp_path, mo
 
 def test_held_out_positions_and_participants_are_reported(tmp_path):
     heard = Listener()
-    result = train_gaze(RAYS, "none", **QUICK, test_zones=2, test_positions=6, test_participants=0.5, progress=heard)
+    result = train_gaze(RAYS, "none", **FOLDED, test_zones=2, test_positions=6, test_participants=0.5, progress=heard)
     test = result.provenance["test"]
     assert result.provenance["rays"] == test["rays_to_train"] < test["rays"] == len(RAYS) and len(test["people"]) == 1
     said = re.findall(r"[\d,]*\d", heard.messages[0])
@@ -279,7 +281,7 @@ def test_an_ensemble_is_one_option(tmp_path):
     from tests.train.gaze.test_ensemble import crowd
 
     out = tmp_path / "gaze.safetensors"
-    options = {**QUICK, "steps": 2, "validation_zones": 1, "ensemble": 2, "half": True}
+    options = {**FOLDED, "steps": 2, "validation_zones": 1, "ensemble": 2, "half": True}
     heard = Listener()
     train_gaze(crowd(), "none", **options, output=out, progress=heard)
     field, meta = load_gaze(out, ns)
@@ -291,7 +293,7 @@ def test_an_ensemble_is_one_option(tmp_path):
 
 def test_hit_points_are_an_environment_in_memory(tmp_path):
     """The saved field has their file next to it, and the same densities."""
-    gaze = train_gaze(RAYS, "hits", **QUICK, voxel_size=0.3)
+    gaze = train_gaze(RAYS, "hits", **FOLDED, voxel_size=0.3)
     assert gaze.environment is not None and gaze.environment.kind == "hits" and gaze.environment.path is None
     assert gaze.provenance["geometry_file"]["voxel"] == pytest.approx(0.3) and not list(tmp_path.iterdir())
     saved = GazeField.open(gaze.save(tmp_path / "gaze.safetensors"))
