@@ -17,18 +17,22 @@ apart, and hips at the origin, are reported.
 
 from __future__ import annotations
 
+import gzip
+import io
 import itertools
 import math
 import operator
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import IO, NamedTuple
 
 import numpy as np
 
 from nerg_mi.errors import NergError, parameter, sanitize
+from nerg_mi.files.atomic import replace_atomically
 from nerg_mi.files.safe_read import BadLineCallback, read_line_blocks
 from nerg_mi.ranges import ELEVATIONS
 
@@ -70,6 +74,52 @@ class SkeletonRows(NamedTuple):
     keypoints: np.ndarray  # (N, K, 3) float64, NaN if missing
     lines: np.ndarray  # (N,) int64, line number in the file, from 1
     confidence: np.ndarray  # (N, K) float64, of the requested keypoints; 1 if the file has none
+
+
+def write_skeleton(
+    path: str | os.PathLike, ids: Sequence[str], times: np.ndarray, keypoints: np.ndarray, *, decimals: int = 6
+) -> None:
+    """Write poses in the given order; files with a name ending in ``.gz`` are compressed.
+
+    Equal input gives equal bytes.
+
+    Parameters
+    ----------
+    ids
+        N names without ``|`` or line breaks.
+    times
+        (N,) integers.
+    keypoints
+        (N, K, 3), NaN if missing, or (N, K, 4) with confidences.
+    decimals
+        Digits after the point; 6 (a micrometre) rotates a head by at most 1e-5 rad.
+
+    Raises
+    ------
+    ValueError
+        For wrong shapes or times that are not integers.
+    NergError
+        For an id that the format cannot represent.
+    """
+    keypoints = np.asarray(keypoints, dtype=np.float64)
+    times = np.asarray(times)
+    n = len(ids)
+    if keypoints.ndim != 3 or len(keypoints) != n or keypoints.shape[2] not in (3, 4):
+        raise ValueError(f"keypoints have shape {keypoints.shape}, expected ({n}, K, 3): one pose for each id")
+    if times.shape != (n,) or not np.issubdtype(times.dtype, np.integer):
+        raise ValueError(
+            f"times must be {n} integers (the format has no fractions), got shape {times.shape} "
+            f"of {times.dtype}; multiply seconds by the frame rate and round"
+        )
+    for i, name in enumerate(ids):
+        if not str(name).strip() or any(c in str(name) for c in "|\r\n"):
+            raise NergError(f"id {name!r} of pose {i} is empty or contains '|' or a line break; rename the participant")
+
+    flat = keypoints.reshape(n, -1)
+    line_format = ", ".join([f"%.{decimals}f"] * flat.shape[1])
+    with replace_atomically(path) as temporary, _open_text(temporary, Path(path).name) as out:
+        for name, time, values in zip(ids, times, flat):
+            out.write(f"{name}|{int(time)}|[{line_format % tuple(values)}]\n")
 
 
 def count_values(path: str | os.PathLike) -> int | None:
@@ -210,7 +260,20 @@ def _is_number(word: str) -> bool:
     return True
 
 
-# ---- Skeleton conventions, and head poses from keypoints ----
+@contextmanager
+def _open_text(path: Path, name: str) -> Iterator[IO[str]]:
+    """Open a text file for writing; compressed if its final ``name`` ends in ``.gz``."""
+    with path.open("wb") as raw:
+        if not name.endswith(".gz"):
+            with io.TextIOWrapper(raw, encoding="utf-8", newline="\n") as out:
+                yield out
+            return
+        # With its final name and without a time, so that equal poses give equal bytes.
+        with io.TextIOWrapper(gzip.GzipFile(name, "wb", fileobj=raw, mtime=0), encoding="utf-8", newline="\n") as out:
+            yield out
+
+
+# ---- Skeleton conventions, head poses from keypoints, and bodies for given head poses ----
 #
 # The paper's proxy for gaze (Section 5.1): a ray from the midpoint of the ears through the nose.
 
@@ -284,6 +347,33 @@ SKELETONS = {
 }
 """Conventions by name. Of several with the same number of keypoints, the first is the default."""
 
+EAR_DISTANCE = 0.15  # metres between the ears of an adult
+NOSE_DISTANCE = 0.12  # metres from the midpoint of the ears to the tip of the nose
+EAR_HEIGHT = 1.58  # metres; height of the ears in _BODY
+
+# The other nineteen keypoints are unnamed in the published code. Bodies made here use a standing adult:
+# (to the left, forward, height) in metres.
+_BODY = {
+    0: (0.10, 0.00, 0.08),
+    1: (0.12, 0.17, 0.02),
+    3: (0.25, 0.02, 1.05),  # left ankle, toe, elbow
+    5: (0.10, -0.06, 0.03),
+    6: (0.10, 0.00, 0.90),
+    7: (0.10, 0.03, 0.48),  # left heel, hip, knee
+    8: (0.19, 0.00, 1.36),
+    9: (0.26, 0.15, 0.88),
+    10: (0.00, 0.00, 1.40),  # left shoulder, wrist; neck
+    12: (-0.10, 0.00, 0.08),
+    14: (-0.25, 0.02, 1.05),
+    16: (-0.10, -0.06, 0.03),  # right ankle, elbow, heel
+    17: (-0.10, 0.00, 0.90),
+    18: (-0.10, 0.03, 0.48),
+    19: (-0.19, 0.00, 1.36),  # right hip, knee, shoulder
+    20: (-0.26, 0.15, 0.88),
+    21: (0.00, 0.00, 1.15),  # right wrist; chest
+}
+_LEFT_EYE, _RIGHT_EYE = 4, 15
+
 
 def head_poses(
     left: np.ndarray, right: np.ndarray, front: np.ndarray, *, pitch: float = 0.0
@@ -330,6 +420,69 @@ def compute_trunk_directions(left: np.ndarray, right: np.ndarray, up: np.ndarray
 def _normalise(v: np.ndarray) -> np.ndarray:
     length = np.linalg.norm(v, axis=1, keepdims=True)
     return np.divide(v, length, out=np.full_like(v, np.nan), where=length > 0)
+
+
+def keypoints_from_head(
+    origin: np.ndarray,
+    direction: np.ndarray,
+    *,
+    floor: float = 0.0,
+    ear_distance: float = EAR_DISTANCE,
+    nose_distance: float = NOSE_DISTANCE,
+) -> np.ndarray:
+    """Make standing bodies whose ears and nose have exactly the given head poses.
+
+    The head has no roll; the body faces in the direction of the head, and is scaled to its height.
+
+    Parameters
+    ----------
+    origin
+        (N, 3) metres, z up: midpoint of the ears.
+    direction
+        (N, 3) of any length.
+    floor
+        Height of the floor in metres.
+    ear_distance, nose_distance
+        Metres between the ears, and from their midpoint to the nose.
+
+    Returns
+    -------
+    numpy.ndarray
+        Keypoints (N, 22, 3), of which :func:`head_poses` equals the input up to rounding.
+
+    Raises
+    ------
+    ValueError
+        For a zero or non-finite direction or origin.
+    """
+    origin = np.atleast_2d(np.asarray(origin, dtype=np.float64))
+    direction = np.atleast_2d(np.asarray(direction, dtype=np.float64))
+    length = np.linalg.norm(direction, axis=1, keepdims=True)
+    bad = np.flatnonzero(~(np.isfinite(length[:, 0]) & (length[:, 0] > 0) & np.isfinite(origin).all(axis=1)))
+    if bad.size:
+        raise ValueError(f"head pose {bad[0]} has a zero or non-finite direction or origin; drop it first")
+    forward = direction / length
+
+    # The left direction is horizontal; a head that looks straight up or down is assumed to face +x.
+    flat = forward * (1.0, 1.0, 0.0)
+    flat_length = np.linalg.norm(flat, axis=1, keepdims=True)
+    heading = np.where(flat_length > 1e-9, flat / np.maximum(flat_length, 1e-9), (1.0, 0.0, 0.0))
+    left = np.stack([-heading[:, 1], heading[:, 0], np.zeros(len(heading))], axis=1)
+    crown = np.cross(forward, left)
+
+    out = np.empty((len(origin), NUM_KEYPOINTS, 3))
+    out[:, LEFT_EAR] = origin + 0.5 * ear_distance * left
+    out[:, RIGHT_EAR] = origin - 0.5 * ear_distance * left
+    out[:, NOSE] = origin + nose_distance * forward
+    eye_centre = origin + 0.75 * nose_distance * forward + 0.25 * nose_distance * crown
+    out[:, _LEFT_EYE] = eye_centre + 0.2 * ear_distance * left
+    out[:, _RIGHT_EYE] = eye_centre - 0.2 * ear_distance * left
+
+    scale = (origin[:, 2:] - floor) / EAR_HEIGHT
+    foot = np.concatenate([origin[:, :2], np.full((len(origin), 1), float(floor))], axis=1)
+    for k, (aside, ahead, height) in _BODY.items():
+        out[:, k] = foot + scale * (aside * left + ahead * heading) + scale * height * np.array([0.0, 0.0, 1.0])
+    return out
 
 
 # ---- Tracked bodies: rays of their heads from skeletons ----

@@ -5,8 +5,8 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.tracking.rays import Rays
+from nerg_mi.tracking.readers.skeleton import keypoints_from_head, write_skeleton
 from tests.cli.rays.running import run
-from tests.tracking.readers.bodies import keypoints_from_head, write_skeleton
 
 MAP = ["--map", "origin=x,y,z direction=a,b,c t=t"]
 UNITY = ["--up", "y", "--hand", "left"]

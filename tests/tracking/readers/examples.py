@@ -18,8 +18,8 @@ from nerg_mi.tracking.rays import Rays
 from nerg_mi.tracking.readers.columns import ColumnMap
 from nerg_mi.tracking.readers.registry import make_options, read_rays
 from nerg_mi.tracking.readers.scene_glasses import FrameNames
+from nerg_mi.tracking.readers.skeleton import keypoints_from_head, write_skeleton
 from tests.files.movies import make_box_table, make_movie
-from tests.tracking.readers.bodies import keypoints_from_head, write_skeleton
 
 
 def read(name: str, *files, skip_bad_lines: bool = False, **options) -> Rays:

@@ -6,8 +6,14 @@ from scipy.spatial.transform import Rotation
 
 from nerg_mi.errors import NergError
 from nerg_mi.tracking.readers import skeleton
-from nerg_mi.tracking.readers.skeleton import RIGHT_EAR, SKELETONS, iterate_skeleton, parse_keypoints
-from tests.tracking.readers.bodies import EAR_DISTANCE, keypoints_from_head, write_skeleton
+from nerg_mi.tracking.readers.skeleton import (
+    RIGHT_EAR,
+    SKELETONS,
+    iterate_skeleton,
+    keypoints_from_head,
+    parse_keypoints,
+    write_skeleton,
+)
 from tests.tracking.readers.examples import dropped, read
 
 # ---- Head poses from skeletons, and bodies for given head poses ----
@@ -26,7 +32,7 @@ def poses_of(body, ears=(skeleton.LEFT_EAR, skeleton.RIGHT_EAR), nose=skeleton.N
 
 def test_body_has_exactly_its_head_pose():
     origin, direction = heads()
-    body = keypoints_from_head(origin, direction)
+    body = skeleton.keypoints_from_head(origin, direction)
     o, d = poses_of(body)
     assert np.abs(o - origin).max() < 1e-6 and np.abs(d - direction).max() < 1e-6
     assert np.isfinite(body).all() and body[..., 2].min() > -0.05
@@ -34,22 +40,24 @@ def test_body_has_exactly_its_head_pose():
     side = body[2:, skeleton.LEFT_EAR] - body[2:, skeleton.RIGHT_EAR]
     left = np.cross([0, 0, 1.0], direction[2:])
     assert np.all(np.sum(side * left, axis=1) > 0)
-    assert np.allclose(np.linalg.norm(side, axis=1), EAR_DISTANCE)
+    assert np.allclose(np.linalg.norm(side, axis=1), skeleton.EAR_DISTANCE)
 
 
-def test_heads_without_keypoints():
+def test_missing_keypoints_and_invalid_heads():
     origin, direction = heads(3)
-    body = keypoints_from_head(origin, direction)
+    body = skeleton.keypoints_from_head(origin, direction)
     body[0, skeleton.NOSE] = np.nan
     body[1, skeleton.NOSE] = 0.5 * (body[1, skeleton.LEFT_EAR] + body[1, skeleton.RIGHT_EAR])
     _, d = poses_of(body)
     assert np.isnan(d[:2]).all() and np.isfinite(d[2]).all()
+    with pytest.raises(ValueError, match="head pose 1"):
+        skeleton.keypoints_from_head(origin, direction * [[1], [0], [1]])
 
 
 def test_body_is_symmetric():
     origin, heading = np.array([[2.0, 3.0, 1.58], [0.0, -1.0, 0.79], [0.5, 0.0, 1.7]]), np.array([0.3, 2.0, -1.1])
     direction = np.stack([np.cos(heading), np.sin(heading), np.zeros(3)], axis=1)
-    body = keypoints_from_head(origin, direction)
+    body = skeleton.keypoints_from_head(origin, direction)
     left = np.cross([0, 0, 1.0], direction)
     both_eyes, ears = (4, 15), (skeleton.LEFT_EAR, skeleton.RIGHT_EAR)
     pairs = np.array([ears, both_eyes, (0, 12), (3, 14), (5, 16), (6, 17), (7, 18), (8, 19), (9, 20)])
@@ -68,7 +76,10 @@ def test_body_is_symmetric():
 
 def test_head_may_be_at_the_origin():
     for origin in ((0, 0, 1.6), (1, 0, 0)):
-        assert np.allclose(poses_of(keypoints_from_head([origin], [(1, 0, 0)]))[0], [origin])
+        assert np.allclose(poses_of(skeleton.keypoints_from_head([origin], [(1, 0, 0)]))[0], [origin])
+    for origin in ((np.nan, 1, 1.6), (1, 1, np.inf)):
+        with pytest.raises(ValueError, match="head pose 0"):
+            skeleton.keypoints_from_head([origin], [(1, 0, 0)])
 
 
 # ---- Skeleton file ----
@@ -89,6 +100,9 @@ def test_round_trip(tmp_path, poses, name):
     (rows,) = iterate_skeleton(path)
     assert list(rows.ids) == ids and np.array_equal(rows.times, times) and np.array_equal(rows.lines, np.arange(1, 8))
     assert np.allclose(rows.keypoints, keypoints, atol=5.1e-7, equal_nan=True)
+    first = path.read_bytes()
+    write_skeleton(path, ids, times, keypoints)
+    assert path.read_bytes() == first  # no clock in the file
     assert [len(run.ids) for run in iterate_skeleton(path, block_lines=3)] == [3, 3, 1]
 
 
@@ -100,6 +114,18 @@ def test_reads_the_published_layout(tmp_path):
     (rows,) = iterate_skeleton(path)
     assert rows.ids[0] == "person 1" and rows.times[0] == 1698822000
     assert np.array_equal(rows.keypoints[0, 11], [33, 34, 35]) and np.isnan(rows.keypoints[0, 1, 1])
+
+
+def test_writer_refuses_invalid_input(tmp_path, poses):
+    ids, times, keypoints = poses
+    path = tmp_path / "day.csv"
+    for wrong, message in (
+        ((ids[:3], times, keypoints), "one pose for each id"),
+        ((ids, times * 0.5, keypoints), "integers"),
+        ((["a|b", *ids[1:]], times, keypoints), "rename the participant"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            write_skeleton(path, *wrong)
 
 
 @pytest.mark.parametrize("keypoints", [None, (21, 2, 13)])
