@@ -45,6 +45,7 @@ EXCEPTIONS = {
     "nerg_mi/files/images.py": "encodes in memory",
     "nerg_mi/figures/style.py:encode": "encodes in memory",
     "nerg_mi/photos/structure_worker.py": "writes to a folder of `create_folder_atomically`, in its own process",
+    "nerg_mi/viewer/compilation.py:compile_stream": "is the standard output of a process",
     "nerg_mi/tracking/readers/skeleton.py:_open_text": "writes to the path of `replace_atomically`",
 }
 

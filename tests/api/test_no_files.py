@@ -112,6 +112,7 @@ def test_a_study_of_a_data_frame_and_a_mesh_writes_no_file(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_a_viewer_of_objects_in_memory_writes_no_file(tmp_path):
     pytest.importorskip("viser")
     result = run_script(VIEWER, tmp_path)

@@ -52,7 +52,7 @@ STATS += "aois.png transitions.png "
 STATS += "about.json"
 if has_parquet():
     STATS += " aois.parquet transitions.parquet durations.parquet participants.parquet"
-GAZE = "--radius 0.6 --steps 2 --min-rays 8 --seed 1 --prior-folds 1"
+GAZE = "--radius 0.6 --steps 2 --min-rays 8 --seed 1"
 
 
 @dataclass(frozen=True)
@@ -170,6 +170,7 @@ CASES = (
         ("a.safetensors", "a.vol"),
         ("a.safetensors", "a.vol", "a.run"),
         ("train.gaze_folds.evaluate_folds", "train.gaze_run.evaluate_folds", "train.gaze_ensemble.evaluate_folds"),
+        defaults={"prior_folds": 1},
     ),
     Case(
         "train gaze",
@@ -177,6 +178,7 @@ CASES = (
         ("a.safetensors",),
         ("a.safetensors", "a.run"),
         ("train.gaze_folds.evaluate_folds", "train.gaze_run.evaluate_folds", "train.gaze_ensemble.evaluate_folds"),
+        defaults={"prior_folds": 1},
     ),
     Case("train prior", "{i}/rays.npz {i}/rays.npz -o {o}/a.safetensors", ("a.safetensors",)),
     Case(
