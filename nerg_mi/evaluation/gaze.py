@@ -194,6 +194,7 @@ evaluated at the ray's own origin, not at the centre of its position.
 _EVALUATION_FRACTION = 0.2
 _RAYS_PER_POSITION = 128  # Rays drawn at each test position for the ray scores
 _SMOOTHED_DIRECTIONS = 2048  # Directions that are smoothed together
+_RESAMPLED_VALUES = 1 << 17  # Densities that are scored together: they fit into a cache of the processor
 _MAX_OWN_RAYS = 512  # Rays that are scored at their own origins, with about as many of each participant
 
 
@@ -443,44 +444,63 @@ def score_methods(
     report = on_progress or (lambda share: None)
     evaluated = _evaluate_methods(test, methods, prior, lambda share: report(_EVALUATION_FRACTION * share))
     rows = [{"method": m.name, **compute_map_scores(test.truth, m.maps), **m.average_rays()} for m in evaluated]
-    bootstrap = [[] for _ in evaluated]
-    for number in range(resamples if N >= 3 else 0):
-        report(_EVALUATION_FRACTION + (1 - _EVALUATION_FRACTION) * number / resamples)
-        times = rng.multinomial(N, np.full(N, 1 / N))
-        share = test.counts * times
-        has_rays = share.sum(axis=1) > 0
-        share = share[has_rays] / share[has_rays].sum(axis=1, keepdims=True)
-        truth = np.einsum("pn,pnd->pd", share, test.participant_densities[has_rays])
-        weights = times[test.sample_participants].astype(float), times[test.own_participants].astype(float)
-        for resampled, m in zip(bootstrap, evaluated):
-            resampled.append({**compute_map_scores(truth, m.maps[has_rays]), **m.average_rays(*weights)})
+    times = rng.multinomial(N, np.full(N, 1 / N), resamples if N >= 3 else 0)
+    report_resampled = lambda share: report(_EVALUATION_FRACTION + (1 - _EVALUATION_FRACTION) * share)
+    bootstrap = _resample_scores(test, evaluated, times, report_resampled)
     for row, resampled, m in zip(rows, bootstrap, evaluated):
-        for k in SCORES if resampled else ():
-            half_width = _measure_half_width([b[k] for b in resampled])
+        for k in SCORES if len(times) else ():
+            half_width = _measure_half_width(resampled[k])
             row[f"{k}.low"], row[f"{k}.high"] = float(row[k] - half_width), float(row[k] + half_width)
         row["integral"] = float(4 * np.pi * m.maps.mean())
     for other, resampled in zip(rows[1:], bootstrap[1:]):
         for k in SCORES:
-            other |= _make_difference(
-                f"{k}.gap", rows[0][k] - other[k], [a[k] - b[k] for a, b in zip(bootstrap[0], resampled)]
-            )
+            other |= _make_difference(f"{k}.gap", rows[0][k] - other[k], bootstrap[0][k] - resampled[k])
     if len(rows) > 1:
         for k in SCORES:
             rows[0] |= {key.replace(".gap", ".less"): v for key, v in rows[-1].items() if key.startswith(f"{k}.gap")}
     return rows
 
 
-def _make_difference(name: str, value: float, resampled: list[float]) -> dict[str, float]:
+def _resample_scores(
+    test: GazeTest, evaluated: list[_EvaluatedMethod], times: np.ndarray, on_progress: Callable[[float], None]
+) -> list[dict[str, np.ndarray]]:
+    """Return the scores (R,) of each method, by name, in R resamples with ``times`` (R, N) of each participant.
+
+    Positions come one after the other, because all methods and resamples there share the normalisation of maps.
+    """
+    maps = np.stack([m.maps for m in evaluated], axis=1)
+    sums, counts = {k: np.zeros((len(times), len(evaluated))) for k in MAP_SCORES}, np.zeros((len(times), 1))
+    size = max(1, _RESAMPLED_VALUES // maps[0].size)
+    for p in range(len(maps) if len(times) else 0):
+        on_progress(p / len(maps))
+        densities, share = test.participant_densities[p].astype(np.float64), test.counts[p] * times
+        has_rays = np.flatnonzero(share.any(axis=1))
+        counts[has_rays] += 1
+        for start in range(0, len(has_rays), size):
+            rows = has_rays[start : start + size]
+            truth = (share[rows] / share[rows].sum(axis=1, keepdims=True)) @ densities
+            for k, values in _score_maps(truth[:, None], maps[p]).items():
+                sums[k][rows] += values
+    means = {k: _divide(total, counts) for k, total in sums.items()}
+    return [{**{k: v[:, i] for k, v in means.items()}, **m.resample_rays(test, times)} for i, m in enumerate(evaluated)]
+
+
+def _divide(total: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """Return means; not a number where nothing counts."""
+    return np.divide(total, count, out=np.full(np.shape(total), np.nan), where=count > 0)
+
+
+def _make_difference(name: str, value: float, resampled: np.ndarray) -> dict[str, float]:
     """Return ``value`` under ``name`` and, if ``resampled``, the ends of its 95 % confidence interval."""
-    if not resampled:
+    if not len(resampled):
         return {name: value}
     half_width = _measure_half_width(resampled)
     return {name: value, f"{name}.low": float(value - half_width), f"{name}.high": float(value + half_width)}
 
 
-def _measure_half_width(resampled: list[float]) -> float:
+def _measure_half_width(resampled: np.ndarray) -> float:
     """Return half the width of the 95 % confidence interval; NaN if the score is not defined."""
-    defined = np.array(resampled)[~np.isnan(resampled)]
+    defined = resampled[~np.isnan(resampled)]
     return 1.96 * float(defined.std()) if defined.size else float("nan")
 
 
@@ -492,21 +512,23 @@ class _EvaluatedMethod(NamedTuple):
     rays: dict[str, np.ndarray]
     own_rays: dict[str, np.ndarray]
 
-    def average_rays(
-        self, weights: np.ndarray | None = None, own_weights: np.ndarray | None = None
-    ) -> dict[str, float]:
-        """Return the mean of each score of rays, with ``weights`` (P, K) and ``own_weights`` (n,)."""
-        return {
-            **{k: _average(v, weights) for k, v in self.rays.items()},
-            **{k: _average(v, own_weights) for k, v in self.own_rays.items()},
-        }
+    def average_rays(self) -> dict[str, float]:
+        """Return the mean of each score of rays."""
+        return {k: _average(v) for k, v in {**self.rays, **self.own_rays}.items()}
+
+    def resample_rays(self, test: GazeTest, times: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the mean (R,) of each score of rays in R resamples with ``times`` (R, N) of each participant."""
+        out, num_participants = {}, times.shape[1]
+        for scores, who in ((self.rays, test.sample_participants), (self.own_rays, test.own_participants)):
+            count = times @ np.bincount(who.ravel(), minlength=num_participants)
+            for k, values in scores.items():
+                out[k] = _divide(times @ np.bincount(who.ravel(), values.ravel(), num_participants), count)
+        return out
 
 
-def _average(values: np.ndarray, weights: np.ndarray | None) -> float:
-    """Return the weighted mean of ``values``; not a number if nothing has weight."""
-    if not values.size or (weights is not None and not weights.any()):
-        return float("nan")
-    return float(np.average(values, weights=weights))
+def _average(values: np.ndarray) -> float:
+    """Return the mean of ``values``; not a number if there are none."""
+    return float(values.mean()) if values.size else float("nan")
 
 
 def _evaluate_methods(
@@ -527,12 +549,12 @@ def _evaluate_methods(
     for name, method in methods.items():
         maps, at, log_own = evaluate(method)
         values = compute_ray_scores(maps, at, at_prior, log_prior)
-        out.append(
-            _EvaluatedMethod(name, test.smooth(maps), values, {OWN_SCORES[0]: (log_own - log_own_prior) / np.log(2)})
-        )
+        out.append(_EvaluatedMethod(name, maps, values, {OWN_SCORES[0]: (log_own - log_own_prior) / np.log(2)}))
         if on_progress is not None:
             on_progress(len(out) / len(methods))
-    return out
+    # Together, because the kernels take more time than the sums.
+    smooth = np.split(test.smooth(np.concatenate([m.maps for m in out])), len(out))
+    return [m._replace(maps=maps) for m, maps in zip(out, smooth)]
 
 
 def score_participants(test: GazeTest, methods: dict[str, Baseline], prior: Baseline, min_rays: int = 64) -> list[dict]:
@@ -547,8 +569,8 @@ def score_participants(test: GazeTest, methods: dict[str, Baseline], prior: Base
             if has_enough.any():
                 scores = compute_map_scores(test.participant_densities[has_enough, i], method.maps[has_enough])
             at_centre, at_own = (which == i for which in (test.sample_participants, test.own_participants))
-            averages = {k: _average(v[at_centre], None) for k, v in method.rays.items()}
-            averages |= {k: _average(v[at_own], None) for k, v in method.own_rays.items()}
+            averages = {k: _average(v[at_centre]) for k, v in method.rays.items()}
+            averages |= {k: _average(v[at_own]) for k, v in method.own_rays.items()}
             row = {"method": method.name, "person": person, "rays": int(test.counts[:, i].sum())}
             rows.append({**row, **scores, **averages})
     return rows
@@ -627,11 +649,16 @@ def find_split_half_fault(participants: int, bits: float, low: float = math.nan)
 
 def compute_map_scores(truth: np.ndarray, maps: np.ndarray) -> dict[str, float]:
     """Return the means over positions of ``MAP_SCORES``."""
+    return {k: float(values.mean()) for k, values in _score_maps(truth, maps).items()}
+
+
+def _score_maps(truth: np.ndarray, maps: np.ndarray) -> dict[str, np.ndarray]:
+    """Return ``MAP_SCORES`` of densities (..., D), whose leading axes are broadcast."""
     return {
-        "KLD": float(metrics.kld(truth, maps, eps=EPS).mean()),
-        "CC": float(metrics.cc(truth, maps).mean()),
-        "SIM": float(metrics.sim(truth, maps).mean()),
-        "MAE": float(metrics.mae(truth, maps).mean()),
+        "KLD": metrics.kld(truth, maps, eps=EPS),
+        "CC": metrics.cc(truth, maps),
+        "SIM": metrics.sim(truth, maps),
+        "MAE": metrics.mae(truth, maps),
     }
 
 

@@ -28,7 +28,7 @@ from nerg_mi.tracking.rays import TRACKING, Rays
 from nerg_mi.tracking_kinds import read_tracking
 from nerg_mi.train.gaze import check_environment
 from nerg_mi.train.gaze_data import find_hit_points
-from nerg_mi.train.prior import ELEVATION_PRIOR
+from nerg_mi.train.prior import ELEVATION_PRIOR, select_prior_kappa
 
 from . import gaze as evaluation
 from .baselines import NEAREST_RAYS, REAIMED_HITS, STACK, Baseline, TunedBaseline, format_settings, make_tuned_baselines
@@ -207,6 +207,8 @@ def evaluate_gaze(
         check_environment(opened, scored, True, reporter)
         reporter.progress(0.02, "baselines")
         hits = find_hit_points(train, opened)
+        # All baselines that are tuned here have the same prior.
+        prior_kappa = prior_kappa or select_prior_kappa(train, "person", seed)
         tune = partial(make_tuned_baselines, train, account["radius"], hits, prior_kappa=prior_kappa, seed=seed)
         baselines = tune(participants=split != "pos", positions=split != "people")
         depth, count = training.get("probes", {}).get("depth", "median"), len(test.centres)
