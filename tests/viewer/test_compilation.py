@@ -41,6 +41,7 @@ def wait_until(condition, seconds=120):
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_a_copy_is_made_in_the_background_and_kept(rgb, make_session, tmp_path, monkeypatch):
     # At a coarse resolution, since the default doubles it as long as a field of noise needs.
     monkeypatch.setattr(compilation, "_PROGRAM", compilation._PROGRAM.replace("()", "(resolution=32)"))
