@@ -152,9 +152,11 @@ _DIRECTIONS = 1024  # of heads, in a convolution
 def run_heads(args) -> None:
     """Print the tables of heads."""
     from nerg_mi.cli.declarations import select_backend
+    from nerg_mi.fields.mlp import namespace
     from nerg_mi.tracking.rays import Rays
 
-    ns = select_backend("llvm_ad_rgb", args.threads)
+    select_backend("llvm_ad_rgb", args.threads)
+    ns = namespace("llvm_ad_rgb")
     scores_of_head: list[dict] = []
     fields: list[dict] = []
     for name, make in parse_environments(args).items():

@@ -95,12 +95,14 @@ def fields(data, args: argparse.Namespace, name: str, depth: bool, deferred=Fals
     """Train once; yields ``(trainer, path, row)`` after each of `make_lengths`, with the current field in a file whose
     name starts with ``name``."""
     from nerg_mi.cli.declarations import select_backend
+    from nerg_mi.fields.mlp import namespace
     from nerg_mi.formats.fields import save_radiance
     from nerg_mi.train.radiance_run import warm_up
     from nerg_mi.train.radiance_settings import RadianceSettings, make_radiance_config
     from nerg_mi.train.radiance_trainer import RadianceTrainer
 
-    ns = select_backend("llvm_ad_rgb", args.threads)
+    select_backend("llvm_ad_rgb", args.threads)
+    ns = namespace("llvm_ad_rgb")
     settings = RadianceSettings(seed=args.seed, **make_lengths(args)[-1], **make_settings(args))
     config = replace(make_radiance_config(args.size, data.box), deferred=deferred)
     trainer = RadianceTrainer(data.train, data.box, config, settings, ns, depth=depth)

@@ -322,13 +322,15 @@ def main(argv=None) -> None:
     args = parser.parse_args(argv)
 
     from nerg_mi.cli.declarations import select_backend
+    from nerg_mi.fields.mlp import namespace
     from nerg_mi.photos.dataset import open_dataset
     from nerg_mi.train.radiance_settings import RadianceSettings, make_radiance_config
     from nerg_mi.train.radiance_trainer import RadianceTrainer
 
     import torch
 
-    ns = select_backend("llvm_ad_rgb", args.threads)
+    select_backend("llvm_ad_rgb", args.threads)
+    ns = namespace("llvm_ad_rgb")
     torch.set_num_threads(args.threads)
     data = open_dataset(args.data, None, args.width)
     if any(v.has_alpha or v.mask is not None for v in data.train):

@@ -57,3 +57,16 @@ def test_libllvm_is_selected_first(path):
     order = [module.split(".")[0] for module, _ in imports(path.read_text(encoding="utf-8"))]
     if {"drjit", "mitsuba"} & {*order}:
         assert "nerg_mi" in order[: min(order.index(name) for name in ("drjit", "mitsuba") if name in order)]
+
+
+@pytest.mark.parametrize("path", SCRIPTS, ids=lambda p: f"{p.parent.name}/{p.name}")
+def test_no_value_is_expected_of_procedures(rgb, path):
+    """A function of nerg_mi that is annotated to return nothing is not assigned."""
+    source = path.read_text(encoding="utf-8")
+    origins = {name: module for module, name in imports(source) if name and module.startswith("nerg_mi")}
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Assign) and isinstance(call := node.value, ast.Call):
+            name = call.func.id if isinstance(call.func, ast.Name) else None
+            if name in origins:
+                function = getattr(import_module(origins[name]), name, None)
+                assert getattr(function, "__annotations__", {}).get("return", "") != "None", ast.unparse(node)
