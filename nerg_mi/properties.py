@@ -132,7 +132,7 @@ def make_volume_class() -> Any:
     """
     import mitsuba as mi
 
-    class FieldVolume(mi.Volume):
+    class NetworkVolume(mi.Volume):
         field: Any
         plugin: str  # name of the registered plugin
 
@@ -191,7 +191,7 @@ def make_volume_class() -> Any:
         def to_string(self):
             return f"{type(self).__name__}[\n" + ",\n".join(f"  {k} = {v}" for k, v in self.describe().items()) + "\n]"
 
-    return FieldVolume
+    return NetworkVolume
 
 
 def read_transform(props, name: str) -> np.ndarray:

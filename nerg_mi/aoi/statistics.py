@@ -207,7 +207,7 @@ def statistics(
     with open_reporter(progress) as reporter:
         reporter.progress(0.0, "reading")
         with _open_parts(chosen, areas, align, sampling, parallel, reporter) as parts:
-            work = _Work(
+            work = _Analysis(
                 open_placed_areas(chosen.environment, chosen.gaze, areas, align, sampling),
                 None if chosen.rays is None else open_recordings(chosen.rays),
                 counting,
@@ -319,7 +319,7 @@ class _Attention:
 
 
 @dataclass(frozen=True, eq=False)
-class _Work:
+class _Analysis:
     """Computes the statistics; ``parts`` is None if all is computed in this process."""
 
     placed: PlacedAreas

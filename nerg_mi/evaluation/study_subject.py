@@ -229,14 +229,14 @@ class StudySubject:
         """Return origins and directions (N, 3) float64 of the rays of a render with one sample per pixel."""
         import mitsuba as mi
 
-        class Recorder(mi.SamplingIntegrator):
+        class RayRecorder(mi.SamplingIntegrator):
             def aov_names(self):
                 return [f"{name}.{c}" for name in "od" for c in "XYZ"]
 
             def sample(self, scene, sampler, ray, medium=None, active=True):
                 return mi.Spectrum(0), mi.Bool(True), [ray.o.x, ray.o.y, ray.o.z, ray.d.x, ray.d.y, ray.d.z]
 
-        picture = self.render(Recorder(mi.Properties()), 1, seed)[..., -6:].reshape(-1, 6).astype(float)
+        picture = self.render(RayRecorder(mi.Properties()), 1, seed)[..., -6:].reshape(-1, 6).astype(float)
         return picture[:, :3], picture[:, 3:]
 
     def render(self, integrator, spp: int, seed: Any) -> np.ndarray:

@@ -207,7 +207,7 @@ def render_film(
         mode = mi.variant() or activate_variant()
         settings = FrameSettings(mode, sensor, spp, seed, memory, overlay, smoothing)
         recorded = {} if overlay is None else {"overlay": overlay, **look}
-        work = _Work(source, listed, settings, drawing, FilmProvenance(source, settings, recorded))
+        work = _FilmTask(source, listed, settings, drawing, FilmProvenance(source, settings, recorded))
         video = work.provenance.make_video(listed[0], existing_files(frames), fps) if is_video else None
         with _open_writer(files, video, fps) as write:
             if parallel.in_parts:
@@ -247,7 +247,7 @@ class Drawing:
 
 
 @dataclass(frozen=True)
-class _Work:
+class _FilmTask:
     scene: FilmScene
     frames: Sequence[Frame]
     settings: FrameSettings
@@ -348,7 +348,7 @@ def _summarize(film: Film, frames: str, memory: float) -> str:
 # ---- Rendering at once ----
 
 
-def _render_at_once(work: _Work, reporter: Reporter, write: Write) -> _Shown:
+def _render_at_once(work: _FilmTask, reporter: Reporter, write: Write) -> _Shown:
     vmax = None
     with Interruption() as stop:
         renderer = FrameRenderer(work.scene, work.settings, len(work.frames), reporter, stop)
@@ -362,7 +362,7 @@ def _render_at_once(work: _Work, reporter: Reporter, write: Write) -> _Shown:
     return _Shown(renderer.size, renderer.channels, renderer.undivided_reason, vmax, renderer.observer_note)
 
 
-def _render_overlays(work: _Work, drawing: Drawing, renderer: FrameRenderer, write: Write) -> float | None:
+def _render_overlays(work: _FilmTask, drawing: Drawing, renderer: FrameRenderer, write: Write) -> float | None:
     """Render pictures with an overlay, and return the upper end of their colour scale.
 
     Pictures of a sequence are stored on disk until the common colour scale is known, unless it is given.
@@ -391,7 +391,7 @@ def _render_overlays(work: _Work, drawing: Drawing, renderer: FrameRenderer, wri
 
 
 def _render_in_parts(
-    work: _Work, output: Path, files: Sequence[Path], parallel: Parallel, reporter: Reporter, write: Write
+    work: _FilmTask, output: Path, files: Sequence[Path], parallel: Parallel, reporter: Reporter, write: Write
 ) -> _Shown:
     """Render each picture as a part, which is stored and not rendered again: the same call resumes.
 

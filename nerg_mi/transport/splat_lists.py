@@ -209,7 +209,7 @@ class SplatLists(SplatHits):
                 state.decided, goes_on = state.decided | is_hidden, goes_on & ~is_hidden
             return state, goes_on
 
-        def body(walk: _Walk) -> tuple[_Walk]:
+        def body(walk: _ListWalk) -> tuple[_ListWalk]:
             rank = dr.gather(ns.UInt32, self._entries, walk.entry, walk.active)
             t, alpha, hit = evaluate(rank, walk.active)
             # What is no hit comes first, and absorbs nothing.
@@ -219,13 +219,13 @@ class SplatLists(SplatHits):
             if blended.density_evals is not None:
                 blended.density_evals = blended.density_evals + dr.select(walk.active, 1, 0)
             entry = walk.entry + 1
-            return (_Walk(walk.active & goes_on & (entry < last), entry, waiting, blended),)
+            return (_ListWalk(walk.active & goes_on & (entry < last), entry, waiting, blended),)
 
         zero = request.init_result(Float)
         none = _Hit(Float(-dr.inf), Float(0), ns.UInt32(0))
         counts = zero.decided, zero.density_evals, zero.color_evals
         blended = _Blend(Float(1), Float(0), Float(dr.inf), Float(1), zero.color, *counts)
-        start = _Walk(request.active & (entry < last), entry, [none] * NUM_WAITING, blended)
+        start = _ListWalk(request.active & (entry < last), entry, [none] * NUM_WAITING, blended)
         (walk,) = dr.while_loop((start,), lambda walk: walk.active, body, label="entries")
         blended, goes_on = walk.blended, request.active & (walk.blended.light > stop)
         if blended.decided is not None:
@@ -342,7 +342,7 @@ class _Blend:
 
 
 @dataclass
-class _Walk:
+class _ListWalk:
     """Loop state of a ray along its list."""
 
     active: Bool

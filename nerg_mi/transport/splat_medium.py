@@ -222,7 +222,7 @@ GROUP_SIZE = 12
 
 
 @dataclass
-class _Walk:
+class _TreeWalk:
     """State of a traversal. ``path``: after a leading 1, one bit per level for the farther child."""
 
     active: Bool
@@ -255,7 +255,7 @@ class SplatHits:
         inverse = [dr.rcp(dr.select(dr.abs(v) > 1e-30, v, 1e-30)) for v in (d.x, d.y, d.z)]
         origin = (o.x, o.y, o.z)
 
-        def test(walk: _Walk) -> _Walk:
+        def test(walk: _TreeWalk) -> _TreeWalk:
             index = dr.gather(UInt32, a.places, walk.node - a.leaves, walk.active)
             t, absorbed, distance = a.find_peak(index, o, d, walk.active)
             behind = (t > after.t) | ((t == after.t) & (index > after.index))
@@ -275,7 +275,7 @@ class SplatHits:
             far, evals = dr.minimum(far, _above(ts[-1])), walk.evals + dr.select(walk.active, 1, 0)
             return replace(walk, far=far, t=ts, absorbed=absorptions, index=indices, evals=evals)
 
-        def step(walk: _Walk) -> _Walk:
+        def step(walk: _TreeWalk) -> _TreeWalk:
             shape = (NODE_SIZE, dr.width(walk.node))
             box = dr.gather(a.rows, a.nodes, walk.node, walk.active, shape=shape)
             near, far = dr.maximum(after.t, 0), walk.far
@@ -296,7 +296,7 @@ class SplatHits:
             path = dr.select(down, walk.path << 1, (walk.path + 1) >> up)
             return replace(tested, active=walk.active & (path != 1), node=node, path=path)
 
-        start = _Walk(
+        start = _TreeWalk(
             active,
             UInt32(1),
             UInt32(1),

@@ -307,7 +307,7 @@ class AriaOptions:
 
 
 @dataclass
-class _Recording:
+class _AriaRecording:
     """A gaze file with its poses."""
 
     gaze: Path
@@ -372,7 +372,7 @@ class Aria:
 READERS = (Aria(),)
 
 
-def _open_recording(gaze: Path, options: AriaOptions, builder: RaysBuilder) -> _Recording:
+def _open_recording(gaze: Path, options: AriaOptions, builder: RaysBuilder) -> _AriaRecording:
     """Read the poses for the gaze file ``gaze``, of which only the times are read yet."""
     schema, person = find_schema(gaze), _find_person(gaze)
     device = resolve_device(options.device, schema.generation)
@@ -387,10 +387,10 @@ def _open_recording(gaze: Path, options: AriaOptions, builder: RaysBuilder) -> _
     rows = Counter(
         {w: int((~interpolate_poses(track, times, _MAX_GAP)[2]).sum()) for w, track in trajectory.tracks.items()}
     )
-    return _Recording(gaze, schema, device, person, trajectory, rows)
+    return _AriaRecording(gaze, schema, device, person, trajectory, rows)
 
 
-def _choose_world(recordings: Sequence[_Recording], requested: str | None) -> str:
+def _choose_world(recordings: Sequence[_AriaRecording], requested: str | None) -> str:
     """The ``requested`` world, or the one with the most gaze. Raises `NergError` if a recording has no pose in it."""
     rows = sum((r.rows for r in recordings), Counter())
     worlds_text = ", ".join(sanitize(w, 40) for w, _ in rows.most_common(4))
@@ -412,7 +412,7 @@ def _choose_world(recordings: Sequence[_Recording], requested: str | None) -> st
     return world
 
 
-def _add_gaze(recording: _Recording, world: str, builder: RaysBuilder) -> None:
+def _add_gaze(recording: _AriaRecording, world: str, builder: RaysBuilder) -> None:
     """Add the gaze of ``recording`` with poses in ``world``."""
     tracks = recording.trajectory.tracks
     builder.begin_source(recording.gaze, f"{recording.person}/{recording.gaze.name}")
