@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import difflib
 import os
-import re
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,8 +18,8 @@ from nerg_mi.files.atomic import check_writable, write_text
 from nerg_mi.files.html import key_value_table
 from nerg_mi.files.values import FilePath, to_numbers
 from nerg_mi.maths.geometry import Similarity
-from nerg_mi.maths.types import Axes, Figure, MitsubaScene, Sensor
-from nerg_mi.registration import get_plugin_class
+from nerg_mi.maths.types import Axes, Figure, MitsubaScene, Sensor, Unpack
+from nerg_mi.progress import Progress
 from nerg_mi.transport.geometry import SceneGeometry, check_shape
 from nerg_mi.transport.observer import ObserverSettings
 
@@ -39,6 +36,7 @@ from .contents import (
     write_content,
 )
 from .hits import NO_DATA_GREY, read_hit_volume, shade_hits
+from .integrator_settings import IntegratorSettings, check_settings
 from .kinds import ROLES, detect_kind
 from .nested_scene import SceneDocument
 from .scene_loading import activate_mitsuba, check_sensor, load_scene
@@ -243,7 +241,9 @@ class Scene:
         observer: ArrayLike | None = None,
         axes: Axes | None = None,
         spp: int = 16,
-        **settings: Any,
+        camera: Camera | int | Sensor | None = None,
+        seed: int = 0,
+        progress: Progress = None,
     ) -> Figure:
         """Render the scene as a figure: its colour, with a quantity over it.
 
@@ -257,8 +257,8 @@ class Scene:
             Axes to draw in. Default: a new figure.
         spp : int
             Samples per pixel.
-        **settings
-            Further arguments of `render`: ``camera``, ``seed`` and ``progress``.
+        camera, seed, progress
+            As for `render`.
 
         Returns
         -------
@@ -282,7 +282,8 @@ class Scene:
 
         name = quantity or ("gaze" if self.has_gaze else COLOR)
         needed = [COLOR, *([] if name == COLOR else ["opacity", name])]
-        return nerg_mi.render(self, observer, needed, spp=spp, **settings).plot(name, axes=axes)
+        pictures = nerg_mi.render(self, observer, needed, camera=camera, spp=spp, seed=seed, progress=progress)
+        return pictures.plot(name, axes=axes)
 
     def _repr_html_(self) -> str:
         lines = [line.strip().partition(": ") for line in repr(self).splitlines()[1:]]
@@ -415,7 +416,7 @@ def make_scene(
     camera: Camera | Mapping[str, Any] | Sensor | None = None,
     observer: ArrayLike | None = None,
     to_world: ArrayLike | None = None,
-    **settings: Any,
+    **settings: Unpack[IntegratorSettings],
 ) -> Scene:
     """Make a scene from an environment, a gaze field, or both, without writing XML.
 
@@ -439,8 +440,8 @@ def make_scene(
     to_world : array_like of shape (4, 4), optional
         Rotation, uniform scale and translation from the frame of both fields to the scene.
     **settings
-        Parameters of the integrator ``nerg``, such as ``falloff=0.3``, ``visibility="map"``, ``density={"type": ...}``
-        or ``kde={"type": "gazekde", "filename": "day.npz"}``. They are documented in its docstring.
+        Parameters of the integrator ``nerg`` (`IntegratorSettings`), such as ``falloff=0.3``, ``visibility="map"`` or
+        ``kde={"type": "gazekde", "filename": "day.npz"}``.
 
     Returns
     -------
@@ -467,9 +468,9 @@ def make_scene(
       camera 0: 48 x 32 pixels
     """
     activate_mitsuba()
-    _check_settings(settings)
     if isinstance(settings.get("field"), (str, os.PathLike, TrainedField, Splats)):
         raise NergError('make_scene has no argument "field"; pass the field as the environment')
+    check_settings(settings)
     integrator: dict[str, Any] = {"type": "nerg", **settings}
     transform = None if to_world is None else _as_transform(to_world)
     children: dict[str, Any] = {}
@@ -520,18 +521,6 @@ def make_scene(
     if isinstance(camera, Camera):
         scene._fit_clip_distances(next(s for s in scene.mitsuba.sensors() if s.id() == "camera"), camera)
     return scene
-
-
-def _check_settings(settings: Mapping[str, Any]) -> None:
-    """Raise `NergError` for a setting that the integrator ``nerg`` does not have; its children can have any name."""
-    manual = sys.modules[get_plugin_class("nerg").__module__].__doc__ or ""
-    rows = re.findall(r"^ \* - ([a-z_]+(?:, [a-z_]+)*)$", manual, re.MULTILINE)
-    allowed = [name for row in rows for name in row.split(", ")]
-    for name, value in settings.items():
-        if isinstance(value, (str, bool, int, float, np.number)) and name not in allowed:
-            near = difflib.get_close_matches(name, allowed, n=1)
-            remedy = f'did you mean "{near[0]}"?' if near else f"available: {join_names(allowed)}"
-            raise NergError(f'make_scene has no setting "{name}"; {remedy}')
 
 
 def _make_observer_sensor(position: ArrayLike) -> dict:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from typing import Unpack as Unpack
 
     from drjit import ArrayBase
     from matplotlib.axes import Axes as Axes
@@ -51,6 +52,7 @@ if TYPE_CHECKING:
 else:
     Bool = Float = UInt32 = Array3f = Ray3f = Any
     Axes = Figure = MitsubaScene = Sensor = Tensor = Any
+    Unpack = type  # that of `typing` needs Python 3.11; only `typing.get_type_hints` reads it here
 
 Point3f: TypeAlias = Array3f  # Position, in the frame that the signature names
 

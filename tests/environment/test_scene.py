@@ -1,13 +1,18 @@
 """Tests of `nerg_mi.environment.scene`."""
 
+import re
+import sys
+
 import numpy as np
 import pytest
 
 import nerg_mi as nerg
 from nerg_mi.environment.gaze import GazeField
+from nerg_mi.environment.integrator_settings import IntegratorSettings
 from nerg_mi.environment.radiance import RadianceField
 from nerg_mi.environment.scene import resolve_quantities
 from nerg_mi.formats.surfaces import write_volume
+from nerg_mi.registration import get_plugin_class
 from tests.formats.splats.writers import random_splats, write_inria
 
 BALL = {"type": "sphere", "radius": 0.3}
@@ -101,6 +106,14 @@ def test05_settings_are_the_integrators(files):
     i = scene.integrator
     assert np.isclose(i.falloff[0], 0.7) and i.settings.step == 0.05  # noqa: RUF069 (stored)
     assert i.observer_settings.visibility == "map" and i.observer_settings.depth == "expected"
+
+
+def test05_settings_are_those_of_the_page():
+    page = sys.modules[get_plugin_class("nerg").__module__].__doc__ or ""
+    rows = re.findall(r"^ \* - ([a-z_]+(?:, [a-z_]+)*)$", page, re.MULTILINE)
+    names = {name for row in rows for name in row.split(", ")}
+    # Children with an argument of their own are no settings; the nested integrator has no name on the page.
+    assert names - {"field", "gaze", "observer"} == IntegratorSettings.__annotations__.keys() - {"integrator"}
 
 
 def test06_a_volume_in_place_of_a_field():
