@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -116,6 +116,26 @@ def make_prior_baseline(
     return evaluate
 
 
+class CachedBaseline:
+    """Caches the densities of a baseline for each pair of position and direction arrays.
+
+    Arrays are compared by identity and must not change. The returned arrays are read-only.
+    """
+
+    def __init__(self, method: Baseline):
+        self._method = method
+        self._answers: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+
+    def __call__(self, positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        for p, d, answer in self._answers:
+            if p is positions and d is directions:
+                return answer
+        answer = np.asarray(self._method(positions, directions))
+        answer.setflags(write=False)
+        self._answers.append((positions, directions, answer))
+        return answer
+
+
 class NearestRays:
     """The training rays nearest to a position, as seen from it.
 
@@ -138,13 +158,18 @@ class NearestRays:
     def find(self, positions: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Find up to ``count`` rays of each of ``positions`` (P, 3): distances (P, k) in metres, nearest first, and
         directions (P, k, 3)."""
+        distance, recorded, aimed = self.find_both(positions, count)
+        return distance, recorded if aimed is None else aimed
+
+    def find_both(self, positions: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+        """Find the same rays: distances, recorded directions, and directions to the hit points, None without them."""
         k = min(count, len(self._directions))
         # A sequence of ranks, so that one neighbour also has an axis of its own.
         distance, index = self._tree.query(positions, k=np.arange(1, k + 1))
         directions = self._directions[index]
-        if self._hits is not None:
-            directions = aim(self._hits[index], directions, positions[:, None], MIN_AIM_DISTANCE)
-        return distance, directions
+        if self._hits is None:
+            return distance, directions, None
+        return distance, directions, aim(self._hits[index], directions, positions[:, None], MIN_AIM_DISTANCE)
 
 
 class NeighbourDensity:
@@ -301,13 +326,17 @@ def make_tuned_baselines(
     columns: list[np.ndarray] = []
     participant: list[np.ndarray] = []
     settings: dict[str, list[dict[str, float]]] = {}
-    make_prior = lambda rays: make_prior_baseline(rays, kappa=prior_kappa, weights=compute_participant_weights(rays))
+    # All baselines evaluate it.
+    make_prior = lambda rays: CachedBaseline(
+        make_prior_baseline(rays, kappa=prior_kappa, weights=compute_participant_weights(rays))
+    )
     for k, fold in enumerate(iter_folds(rays, radius, _FOLDS, seed, participants=participants, positions=positions)):
         # At recorded and at new positions alike: settings for the few positions far from all others do worse elsewhere.
         test = fold.sample(_MAX_TEST_RAYS, seed + k)
         prior_densities = make_prior(fold.train)(np.zeros((1, 3)), test.direction)[0]
+        neighbours = _find_neighbours(fold.train, test, REAIMED_HITS in kinds)
         for name, (is_conditional, is_aimed) in kinds.items():
-            scored = _score_neighbours(fold.train, test, prior_densities, is_conditional, is_aimed)
+            scored = _score_neighbours(neighbours, test, prior_densities, is_conditional, is_aimed)
             scores[name].append(_average_participants(scored.log_density, test))
             settings[name] = scored.settings
         columns.append(np.column_stack([prior_densities, *_evaluate_kernels(fold.train, test, aims)]))
@@ -420,9 +449,29 @@ def _make_neighbour_density(
     )
 
 
-def _score_neighbours(train: Rays, test: Rays, prior: np.ndarray, is_conditional: bool, is_aimed: bool) -> _Candidates:
-    """Score the densities of the neighbours of ``train`` at the n rays ``test``; ``prior`` (n,) are the prior's."""
-    neighbours = NearestRays(train, train.hit if is_aimed else None)
+class _Neighbours(NamedTuple):
+    """The k training rays nearest to some held-out rays."""
+
+    distance: np.ndarray  # (b, k), nearest first
+    cosine: np.ndarray  # Of the angle between each held-out ray and the recorded directions (b, k)
+    aimed_cosine: np.ndarray | None  # The same of the directions to the hit points; None without them
+
+
+def _find_neighbours(train: Rays, test: Rays, is_aimed: bool) -> list[_Neighbours]:
+    """Find the neighbours of the rays ``test`` in blocks of `_BLOCK`; to the hit points as well if ``is_aimed``."""
+    near, blocks = NearestRays(train, train.hit if is_aimed else None), []
+    for start in range(0, len(test), _BLOCK):
+        rows = slice(start, start + _BLOCK)
+        distance, recorded, aimed = near.find_both(test.origin[rows], COUNTS[-1])
+        compare = lambda directions, rows=rows: np.einsum("bkc,bc->bk", directions, test.direction[rows])
+        blocks.append(_Neighbours(distance, compare(recorded), None if aimed is None else compare(aimed)))
+    return blocks
+
+
+def _score_neighbours(
+    neighbours: Sequence[_Neighbours], test: Rays, prior: np.ndarray, is_conditional: bool, is_aimed: bool
+) -> _Candidates:
+    """Score the densities of the ``neighbours`` of the n rays ``test``; ``prior`` (n,) are the prior's."""
     counts = COUNTS[-1:] if is_conditional else COUNTS
     keys = [
         {"rays": float(counts[-1]), "bandwidth": h} if is_conditional else {"rays": float(k)}
@@ -430,11 +479,13 @@ def _score_neighbours(train: Rays, test: Rays, prior: np.ndarray, is_conditional
         for k in counts
     ]
     plain = np.empty((len(KAPPAS), len(keys), len(test)))
-    for rows, distance, cosine in _iter_cosines(neighbours, test, counts[-1]):
+    for block, (distance, recorded, aimed) in enumerate(neighbours):
+        rows, cosine = slice(block * _BLOCK, (block + 1) * _BLOCK), aimed if is_aimed else recorded
+        assert cosine is not None
+        weights = [_weigh(distance, h) for h in BANDWIDTHS] if is_conditional else []
         for i, kappa in enumerate(KAPPAS):
             kernel = np.exp(kappa * (cosine - 1) + log_normaliser(kappa))
             if is_conditional:
-                weights = [_weigh(distance, h) for h in BANDWIDTHS]
                 values = [(w * kernel).sum(axis=1) / w.sum(axis=1) for w in weights]
             else:
                 total = np.cumsum(kernel, axis=1)
@@ -447,15 +498,6 @@ def _score_neighbours(train: Rays, test: Rays, prior: np.ndarray, is_conditional
                 settings.append({**key, "kappa": kappa, "prior weight": weight})
                 log_density.append(np.log(np.maximum((1 - weight) * plain[i, j] + weight * prior, _MIN_DENSITY)))
     return _Candidates(settings, np.array(log_density))
-
-
-def _iter_cosines(neighbours: NearestRays, test: Rays, count: int) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
-    """Yield, for blocks of the rays ``test``, the distances (b, k) of their neighbours and the cosines (b, k) of the
-    angles to them."""
-    for start in range(0, len(test), _BLOCK):
-        rows = slice(start, start + _BLOCK)
-        distance, aimed = neighbours.find(test.origin[rows], count)
-        yield rows, distance, np.einsum("bkc,bc->bk", aimed, test.direction[rows])
 
 
 def _average_participants(log_density: np.ndarray, test: Rays) -> np.ndarray:

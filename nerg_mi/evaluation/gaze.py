@@ -29,27 +29,6 @@ from nerg_mi.transport.observer_gaze import GazeFieldInstance, ObservedGaze
 from . import metrics
 from .baselines import Baseline
 
-
-class CachedBaseline:
-    """Caches the densities of a baseline for each pair of position and direction arrays.
-
-    Arrays are compared by identity and must not change. The returned arrays are read-only.
-    """
-
-    def __init__(self, method: Baseline):
-        self._method = method
-        self._answers: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
-
-    def __call__(self, positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        for p, d, answer in self._answers:
-            if p is positions and d is directions:
-                return answer
-        answer = np.asarray(self._method(positions, directions))
-        answer.setflags(write=False)
-        self._answers.append((positions, directions, answer))
-        return answer
-
-
 # ---- Densities of a trained gaze field at positions, and the table of scores ----
 
 

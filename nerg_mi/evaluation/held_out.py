@@ -31,9 +31,18 @@ from nerg_mi.train.gaze_data import find_hit_points
 from nerg_mi.train.prior import ELEVATION_PRIOR, select_prior_kappa
 
 from . import gaze as evaluation
-from .baselines import NEAREST_RAYS, REAIMED_HITS, STACK, Baseline, TunedBaseline, format_settings, make_tuned_baselines
+from .baselines import (
+    NEAREST_RAYS,
+    REAIMED_HITS,
+    STACK,
+    Baseline,
+    CachedBaseline,
+    TunedBaseline,
+    format_settings,
+    make_tuned_baselines,
+)
 from .baselines import PRIOR as PRIOR_BASELINE
-from .gaze import EPS, SCORES, SPLIT_HALF, CachedBaseline, FieldDensity
+from .gaze import EPS, SCORES, SPLIT_HALF, FieldDensity
 from .gaze_report import draw_comparison, explain_missing, write_report
 from .position_scores import AWAY, RECORDED, format_verdicts, score_kinds
 from .uncertainty import correlate_uncertainty, measure_calibration, score_positions

@@ -48,8 +48,9 @@ def score_kinds(
         if not mask.any():
             continue
         rays = sample_participants_equally(held_out.select(mask), _MAX_RAYS, seed)
-        baselines = tune(kind)
-        evaluate = lambda method, rays=rays: _log_bits(method(rays.origin, rays.direction[:, None])[:, 0])
+        # The same arrays for all, so that baselines which share a density evaluate it once.
+        baselines, at = tune(kind), (rays.origin, rays.direction[:, None])
+        evaluate = lambda method, at=at: _log_bits(method(*at)[:, 0])
         prior = evaluate(baselines[PRIOR])
         gains = {name: evaluate(method) - prior for name, method in {"gaze field": field, **baselines}.items()}
         people = np.unique(rays.person)

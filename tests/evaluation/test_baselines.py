@@ -17,6 +17,7 @@ from nerg_mi.evaluation.baselines import (
     REAIMED_HITS,
     STACK,
     UNIFORM,
+    CachedBaseline,
     NearestRays,
     NeighbourDensity,
     format_settings,
@@ -70,6 +71,19 @@ def test_the_prior_can_give_each_participant_the_same_weight():
     density = make_prior_baseline(rays, kappa=30.0, weights=compute_participant_weights(rays))(np.zeros((1, 3)), X)
     each = [reference(X, rays.direction[person == p], [0, np.sum(person == p)], [30.0])[0] for p in range(4)]
     assert np.allclose(density[0], np.mean(each, axis=0), rtol=2e-4)
+
+
+def test_cached_baseline_evaluates_equal_arrays_once():
+    calls = []
+    method = CachedBaseline(lambda *options: calls.append(1) or make_uniform_baseline()(*options))
+    positions, directions = np.zeros((2, 3)), fibonacci_directions(8)
+    first = method(positions, directions)
+    assert method(positions, directions) is first and len(calls) == 1
+    # Equal values in other arrays are not compared.
+    np.testing.assert_array_equal(method(positions.copy(), directions), first)
+    assert len(calls) == 2
+    with pytest.raises(ValueError, match="read-only"):
+        first[0] = 0
 
 
 @pytest.mark.parametrize("bandwidth", [None, 0.3])
@@ -160,8 +174,9 @@ def test_the_scores_of_the_folds_are_those_of_the_densities():
     train, test = rays.select(rays.person == 0), rays.select(np.flatnonzero(rays.person == 1)[:50])
     prior = make_prior_baseline(train, kappa=20.0)
     at_rays = lambda density: density(test.origin, test.direction[:, None])[:, 0]
+    blocks = baselines._find_neighbours(train, test, True)
     for is_conditional, is_aimed in ((False, False), (True, False), (False, True)):
-        scored = baselines._score_neighbours(train, test, at_rays(prior), is_conditional, is_aimed)
+        scored = baselines._score_neighbours(blocks, test, at_rays(prior), is_conditional, is_aimed)
         for index in (0, len(scored.settings) // 2, len(scored.settings) - 2):
             neighbours = NearestRays(train, train.hit if is_aimed else None)
             density = baselines._make_neighbour_density(neighbours, prior, scored.settings[index])

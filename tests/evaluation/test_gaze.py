@@ -26,22 +26,6 @@ from tests.plugins import fields
 from tests.plugins.scenes import camera, channels
 from tests.refusals import mentions
 
-# ---- Cache ----
-
-
-def test_cached_baseline_evaluates_equal_arrays_once():
-    calls = []
-    method = gaze.CachedBaseline(lambda *options: calls.append(1) or make_uniform_baseline()(*options))
-    positions, directions = np.zeros((2, 3)), fibonacci_directions(8)
-    first = method(positions, directions)
-    assert method(positions, directions) is first and len(calls) == 1
-    # Equal values in other arrays are not compared.
-    np.testing.assert_array_equal(method(positions.copy(), directions), first)
-    assert len(calls) == 2
-    with pytest.raises(ValueError, match="read-only"):
-        first[0] = 0
-
-
 # ---- Evaluation of gaze: truth from participants, scores against closed forms, held-out data ----
 
 
