@@ -839,8 +839,9 @@ class ConstantWeightsTrial:
         integrator = scene.integrator()
         trained = get_trained_fields(integrator) if is_nerg(integrator) else []
         constant = bool(trained) and self._choose(samples)
-        for field in trained if constant else ():
-            set_constant_weights(field)
+        # A single image has the weights that its scene has in memory.
+        for field in trained if self._images > 1 else ():
+            set_constant_weights(field, constant)
         return constant
 
     def record(self, constant: bool, samples: int, seconds: float) -> None:

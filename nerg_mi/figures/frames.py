@@ -15,7 +15,8 @@ import numpy as np
 from nerg_mi.environment import bands
 from nerg_mi.environment.bands import ConstantWeightsTrial, SamplePace
 from nerg_mi.environment.rendering_files import DisplayRows, open_image_rows
-from nerg_mi.environment.scene_loading import list_scene_files, load_scene
+from nerg_mi.environment.scene_loading import list_scene_files
+from nerg_mi.environment.scene_sequence import SceneSequence
 from nerg_mi.environment.sensors import describe_observer
 from nerg_mi.errors import NergError, parameter, translate_mitsuba_errors
 from nerg_mi.files.atomic import replace_atomically
@@ -33,6 +34,9 @@ BYTES_PER_PIXEL = 400
 
 RESERVE = 150e6
 """Bytes reserved in addition to a band: for its strips and the first kernel compilation."""
+
+MIN_BAND_BYTES = 16e6
+"""Bytes of a band, even if there is less memory: smaller ones save little and take longer."""
 
 Frame = Mapping[str, str]
 """Values of `<default>`s of a scene file."""
@@ -60,10 +64,6 @@ class FilmScene:
     path: Path
     values: Frame
     loaded: Any = None
-
-    def load(self, frame: Frame) -> Any:
-        """Return the Mitsuba scene of a frame."""
-        return load_scene(self.path, {**self.values, **frame}) if self.loaded is None else self.loaded
 
     def list_files(self, frame: Frame) -> list[Path]:
         """Return the scene file and the files that it names; none for a scene in memory."""
@@ -215,13 +215,16 @@ class FrameRenderer:
         self._scene, self._settings, self._num_frames = scene, settings, num_frames
         self._reporter, self._stop = reporter, stop
         self._start, self._num_done = time.perf_counter(), 0
+        self._sequence = SceneSequence(scene.path)
         self._pace, self._trial = SamplePace(), ConstantWeightsTrial(num_frames)
 
     def render(self, frame: Frame, provenance: FilmProvenance) -> RenderedPicture:
         """Return the image of a frame, which is rendered while it is written."""
         loaded, camera = self._load(frame)
-        rows = bands.fit_rows_to_memory(loaded, camera, 1e9 * self._settings.memory - resident_bytes() - RESERVE)
-        self.undivided_reason = bands.undividable_reason(loaded, camera) if rows < self.size[1] else None
+        free = 1e9 * self._settings.memory - resident_bytes() - RESERVE
+        fit = lambda memory: bands.fit_rows_to_memory(loaded, camera, memory)
+        self.undivided_reason = bands.undividable_reason(loaded, camera) if fit(free) < self.size[1] else None
+        rows = fit(max(free, MIN_BAND_BYTES))
         make_header = lambda: provenance.make(frame).text() | describe_bases(loaded)
         return RenderedPicture(self.size, self._render_bands(loaded, camera, rows), make_header)
 
@@ -254,7 +257,9 @@ class FrameRenderer:
 
     def _load(self, frame: Frame) -> tuple[Any, Any]:
         """Return the scene of a frame and the sensor."""
-        loaded = self._scene.load(frame)
+        loaded = self._scene.loaded
+        if loaded is None:
+            loaded = self._sequence.load({**self._scene.values, **frame})
         self._stop.check()
         if not self.observer_note and (note := describe_observer(loaded)):
             self.observer_note = note
