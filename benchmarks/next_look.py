@@ -78,8 +78,12 @@ def run_looks(args) -> None:
             row |= {"law": f"{law[0]:.2f}", "law, preferences": f"{law[1]:.2f}"}
         rows.append(row)
     columns = list(dict.fromkeys(key for row in rows for key in row))
-    seeds = ", ".join(map(str, range(args.seed, args.seed + args.folds)))
-    save_result("next-look", columns, [[row.get(key, "") for key in columns] for row in rows], seeds)
+    save_result("next-look", columns, [[row.get(key, "") for key in columns] for row in rows], list_seeds(args))
+
+
+def list_seeds(args) -> str:
+    """The seeds of the folds, as a result states them."""
+    return ", ".join(map(str, range(args.seed, args.seed + args.folds)))
 
 
 def train(folder: Path, rays: Path, where: str | Path, seed: int, threads: int | None) -> Path:
@@ -173,8 +177,9 @@ def run_heads(args) -> None:
                 scores_of_head += [{"scene": name, "surfaces": surfaces, **row} for row in scores]
             of_heads = train(folder, heads, "none", seed, args.threads)
             fields += [{"scene": name, **row} for row in compare_fields(gaze, of_heads, rays, ns)]
-    show_head(scores_of_head)
-    show_fields(fields)
+    seeds = list_seeds(args)
+    show_head(scores_of_head, seeds)
+    show_fields(fields, seeds)
 
 
 def score_head(gaze: Path, rays) -> list[dict]:
@@ -240,7 +245,7 @@ def average(rows: list[dict], score: str) -> str:
     return f"{mean.mean():+.3f} ± {half_width:.3f}" if np.isfinite(half_width) else f"{mean.mean():.3f}"
 
 
-def show_head(each: list[dict]) -> None:
+def show_head(each: list[dict], seeds: str) -> None:
     table = []
     for scene, surfaces in dict.fromkeys((row["scene"], row["surfaces"]) for row in each):
         rows = [row for row in each if (row["scene"], row["surfaces"]) == (scene, surfaces)]
@@ -254,10 +259,10 @@ def show_head(each: list[dict]) -> None:
         ]
         table.append([scene, surfaces, *angles, *bits, average(by_method[HEAD], "gap")])
     head = ["scene", "surfaces", "right", "up", "field", HEAD, "head and prior", BOTH, "more"]
-    save_result("heads-bits", head, table)
+    save_result("heads-bits", head, table, seeds)
 
 
-def show_fields(each: list[dict]) -> None:
+def show_fields(each: list[dict], seeds: str) -> None:
     table = []
     for score in SCORES:
         for scene in dict.fromkeys(row["scene"] for row in each):
@@ -269,7 +274,7 @@ def show_fields(each: list[dict]) -> None:
                 [score, scene, kappa, *means, *(average(by_method[m], f"{score}.gap") for m in (HEADS, WIDENED))]
             )
     head = ["score", "scene", "kappa", "prior", "gaze", HEADS, WIDENED, "gaze minus heads", "gaze minus widened"]
-    save_result("heads-fields", head, table)
+    save_result("heads-fields", head, table, seeds)
 
 
 if __name__ == "__main__":
