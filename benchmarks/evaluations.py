@@ -137,7 +137,7 @@ def main(argv=None) -> None:
         for r in rows
     ]
     name, head = ("compiled-fields", COMPILED_HEAD) if args.compiled else ("evaluations", HEAD)
-    save_result(name, head, shown)
+    save_result(name, head, shown, "1")
 
 
 if __name__ == "__main__":

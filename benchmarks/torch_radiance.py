@@ -48,7 +48,7 @@ def take_turns(ours, peer, turns: int, result: str, steps: int = 8, before: int 
         quartiles = spread(1e3 * c / steps for _, c in times)
         rows.append([name, f"{1e3 * wall / steps:.1f}", f"{1e3 * cpu / steps:.1f}", quartiles, *ratios])
     head = ["trainer", "time per step, ms", "CPU time, ms", "quartiles of CPU time, ms"]
-    save_result(result, [*head, "relative time", "relative CPU time"], rows)
+    save_result(result, [*head, "relative time", "relative CPU time"], rows, "0")
 
 
 _PRIMES = (1, 2654435761, 805459861)
