@@ -28,9 +28,10 @@ from .placed import (
     merge_members,
     sample_cone,
 )
-from .settings import VisitRules
+from .settings import TrackerError, VisitRules
 from .shares import SamplePoints, VisibilityCache
-from .visits import ALL, Cell, Visits, VisitSums, find_visits, make_timeline, sum_visits
+from .tracker_error import Disturbance, read_validation
+from .visits import ALL, Cell, Visits, VisitSums, find_visits, join_cells, make_timeline, sum_visits
 
 # ---- Cohorts ----
 
@@ -88,6 +89,10 @@ class Counting:
         Whether the visibility of AOIs is analysed.
     fov
         Angle of the field of view in degrees.
+    error
+        Error of the eye tracker.
+    validation
+        File with the error of each participant (`read_validation`), which replaces ``error``.
     """
 
     rules: VisitRules = VisitRules()
@@ -96,6 +101,18 @@ class Counting:
     cohorts: Path | None = None
     aoi_visibility: bool = False
     fov: float = 120.0
+    error: TrackerError = TrackerError()
+    validation: Path | None = None
+
+    @property
+    def has_error(self) -> bool:
+        """Whether measures are corrected for the error of the tracker."""
+        return self.validation is not None or self.error.accuracy > 0 or self.error.precision > 0
+
+    @cached_property
+    def disturbance(self) -> Disturbance:
+        """The error of the tracker, by participant."""
+        return Disturbance(self.error, {} if self.validation is None else read_validation(self.validation))
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,7 +234,14 @@ def count_block(rays: Rays, context: AoiContext) -> VisitSums:
     hits = context.assign_hits(rays)
     cells = context.cell_masks(rays, context.placed.environment.points_to_field(rays.origin))
     names, rules = context.placed.areas.names, context.counting.rules
-    return sum_visits(rays, hits, names, cells, rules, context.visibility(rays), context.transition_areas)
+    recorded = sum_visits(rays, hits, names, cells, rules, context.visibility(rays), context.transition_areas)
+    if not context.counting.has_error:
+        return recorded
+    parts = [recorded]
+    for draw, disturbed in enumerate(context.counting.disturbance.draw(rays, rules), 1):
+        of_draw = [(replace(cell, draw=draw), mask) for cell, mask in cells]
+        parts.append(sum_visits(disturbed, context.assign_hits(disturbed), names, of_draw, rules, None, ()))
+    return join_cells(parts)
 
 
 def find_area_visits(rays: Rays, context: AoiContext) -> dict[str, Visits]:

@@ -239,6 +239,10 @@ class StatisticsResult(ResultTables):
         Measures of single participants.
     what_if
         Predicted effects of the changes.
+    tracker
+        Measures by cell and area, corrected for the error of the eye tracker.
+    resolution
+        Areas, and pairs of neighbours, that are too small for its accuracy.
     sums
         Sums that the tables were computed from.
     num_suppressed
@@ -247,7 +251,17 @@ class StatisticsResult(ResultTables):
         Origin of the tables.
     """
 
-    TABLES = ("aois", "differences", "power", "transitions", "durations", "participants", "what_if")
+    TABLES = (
+        "aois",
+        "differences",
+        "power",
+        "transitions",
+        "durations",
+        "participants",
+        "what_if",
+        "tracker",
+        "resolution",
+    )
 
     aois: list[Row] = field(default_factory=list)
     differences: list[Row] = field(default_factory=list)
@@ -256,6 +270,8 @@ class StatisticsResult(ResultTables):
     durations: list[Row] = field(default_factory=list)
     participants: Sequence[Row] = ()
     what_if: list[Row] = field(default_factory=list)
+    tracker: list[Row] = field(default_factory=list)
+    resolution: list[Row] = field(default_factory=list)
     sums: VisitSums | None = None
     num_suppressed: int = 0
     provenance: Provenance = field(default_factory=lambda: Provenance("nerg stats"))

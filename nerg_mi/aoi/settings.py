@@ -73,3 +73,24 @@ class ObserverGrid(ValidatedDataclass):
     """Height of the floor along the up axis, in scene units."""
     grid_step: float = range_field(0.25, Range(0.01, 10**6))
     """Distance between neighbouring positions, in metres."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackerError(ValidatedDataclass):
+    """Error of the eye tracker in degrees. Without one, measures are those of the recorded directions."""
+
+    GROUP: ClassVar = "Analysis"
+
+    accuracy: float = setting(
+        0.0,
+        "Accuracy of the eye tracker in degrees: the mean angle of its offset, which is constant in a session. The "
+        "table tracker then has measures corrected for it, and the table resolution what is too small for it.",
+        Range(0, 20),
+    )
+    precision: float = setting(
+        0.0,
+        "Precision of the eye tracker in degrees: the root mean square angle of the noise of a sample.",
+        Range(0, 20),
+    )
+    draws: int = range_field(10, Range(2, 1000))
+    """Number of random errors that the correction averages over."""

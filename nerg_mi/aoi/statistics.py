@@ -51,7 +51,7 @@ from .predicted import (
     warn_missing_support,
     what_if_rows,
 )
-from .settings import AoiSampling, ObserverGrid, VisitRules
+from .settings import AoiSampling, ObserverGrid, TrackerError, VisitRules
 from .statistics_parts import PartitionedStatistics, save_objects
 from .tables import (
     MAX_COMPARED_VALUES,
@@ -66,6 +66,7 @@ from .tables import (
     duration_rows,
     transition_rows,
 )
+from .tracker_error import resolution_rows, tracker_rows
 from .visits import ALL, Cell, VisitSums, merge_sums
 
 
@@ -76,6 +77,7 @@ def statistics(
     *,
     align: FilePath | AnySimilarity | None = None,
     cohorts: FilePath | None = None,
+    validation: FilePath | None = None,
     windows: Mapping[str, Sequence[float]] | None = None,
     zones: FilePath | AnyAreas | None = None,
     what_if: FilePath | Mapping[str, Any] | None = None,
@@ -90,6 +92,7 @@ def statistics(
     show_names: bool = False,
     salt: FilePath | None = None,
     rules: VisitRules = VisitRules(),
+    error: TrackerError = TrackerError(),
     sampling: AoiSampling = AoiSampling(),
     grid: ObserverGrid = ObserverGrid(),
     parallel: Parallel = Parallel(),
@@ -114,6 +117,9 @@ def statistics(
     cohorts : path, optional
         CSV file with columns person,cohort; attention is reported separately for each cohort. Default: the cohorts in
         the rays.
+    validation : path, optional
+        CSV file with columns person,accuracy,precision in degrees: the errors of the eye tracker by participant, which
+        replace accuracy and precision.
     windows : mapping, optional
         Start and end of a time window by its name, NAME=FROM,TO in seconds of the rays' clock; attention is reported
         separately in it; repeatable.
@@ -148,6 +154,8 @@ def statistics(
         Secret file from which pseudonyms are derived, so that several runs agree. Default: random, not stored.
     rules : VisitRules
         Durations that define a visit (`nerg_mi.aoi.settings.VisitRules`).
+    error : TrackerError
+        Error of the eye tracker (`nerg_mi.aoi.settings.TrackerError`).
     sampling : AoiSampling
         How rays are assigned to AOIs, and how the gaze field is sampled (`nerg_mi.aoi.settings.AoiSampling`).
     grid : ObserverGrid
@@ -194,6 +202,8 @@ def statistics(
         None if cohorts is None else to_path(cohorts),
         aoi_visibility,
         fov,
+        error,
+        None if validation is None else to_path(validation),
     )
     files = existing_files(chosen.environment, chosen.gaze, chosen.rays, areas.path, what_if)
     plain = {
@@ -308,10 +318,11 @@ def _open_parts(
 
 @dataclass(frozen=True, eq=False)
 class _Attention:
-    """Attention of participants by cell and source: ``sums`` of recordings, and what a gaze field predicts from
-    ``viewpoints``, with the recorded ``times`` of participants."""
+    """Attention of participants by cell and source: ``sums`` of recordings and those with added ``error``, and what a
+    gaze field predicts from ``viewpoints``, with the recorded ``times`` of participants."""
 
     sums: VisitSums | None
+    error: VisitSums | None
     viewpoints: Viewpoints
     predicted: PredictedAttention | None
     people: Mapping[Cell, Mapping[str, Participants]]
@@ -346,8 +357,11 @@ class _Analysis:
         """Count visits, and predict the attention from recorded positions or those of observers."""
         people: dict[Cell, dict[str, Participants]] = {ALL: {}}
         times: dict[Cell, dict[str, float]] = {}
+        error = None
         if self.rays is not None:
-            sums, viewpoints = self._count(self.rays, num_viewpoints)
+            counted, viewpoints = self._count(self.rays, num_viewpoints)
+            sums = counted.select_draw(0)
+            error = counted if self.counting.has_error else None
             for cell in sums.cells:
                 tracked = Participants.from_sums(sums, cell, self.counting.aoi_visibility)
                 people[cell] = {MEASURED: tracked}
@@ -366,20 +380,21 @@ class _Analysis:
                     people[cell][PREDICTED] = predicted_people
         _report_small_groups(people, self.reporter)
         _report_values_without_comparison(people, self.reporter)
-        return _Attention(sums, viewpoints, predicted, people, times)
+        return _Attention(sums, error, viewpoints, predicted, people, times)
 
     def _count(self, rays: Rays | RayDataset, num_viewpoints: int) -> tuple[VisitSums, Viewpoints]:
         context, count = self._make_context(rays), len(rays)
         picker = ViewpointSampler(max(1, count // num_viewpoints))
         has_gaze = self.placed.sampler is not None
+        picks = has_gaze or self.counting.has_error
 
         def pick(block: Rays) -> None:
-            if has_gaze:
+            if picks:
                 picker.add(block, context)
 
         blocks = self._count_blocks(rays, context, pick, count)
         if self.parts is not None:
-            blocks = self.parts.count(rays, context, pick if has_gaze else None)
+            blocks = self.parts.count(rays, context, pick if picks else None)
         sums = merge_sums(blocks)
         self.reporter.message(f"{count:,} rays of {len(sums.find_participants(ALL)[0]):,} participants")
         viewpoints = picker.viewpoints()
@@ -466,12 +481,35 @@ class _Analysis:
         result = StatisticsResult(aois=rows, differences=differences, power=power_table, sums=sums)
         if sums is None:
             return result
+        if attention.error is not None:
+            result = replace(result, **self._make_tracker_tables(attention.error, attention.viewpoints.positions))
         return replace(
             result,
             transitions=transition_rows(sums, floor),
             durations=duration_rows(sums, floor),
             participants=self._list_participants(sums, show_names, salt),
         )
+
+    def _make_tracker_tables(self, sums: VisitSums, observers: np.ndarray) -> dict[str, list[Row]]:
+        """Return the tables of the tracker's error, from sums with the disturbed samples."""
+        self.reporter.progress(0.97, "error of the tracker")
+        error, disturbance = self.counting.error, self.counting.disturbance
+        missing = [p for p in sums.find_participants(ALL)[1] if p not in disturbance.by_participant]
+        if disturbance.by_participant and missing:
+            self.reporter.warn(
+                f'{len(missing):,} participants, such as "{sanitize(missing[0], 40)}", are not in the table of '
+                f"{parameter('validation')}; their accuracy is taken as {error.accuracy:g} and their precision as "
+                f"{error.precision:g} degrees"
+            )
+        names = self.placed.areas.names
+        corrected = tracker_rows(names, sums, error.draws, self.floor, resamples=self.resamples, seed=self.seed)
+        too_small = resolution_rows(self.placed, observers, disturbance.mean_accuracy)
+        if too_small:
+            self.reporter.warn(
+                f"{len(too_small):,} areas or pairs, such as {too_small[0]['aoi']}, are smaller than twice the "
+                "accuracy of the tracker; they are in the table resolution"
+            )
+        return {"tracker": corrected, "resolution": too_small}
 
     def _list_participants(self, sums: VisitSums, show_names: bool, salt: FilePath | None) -> Sequence[Row]:
         if self.floor.minimum > 1:

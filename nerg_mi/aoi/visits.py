@@ -122,10 +122,14 @@ BINS = np.array([0.0, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0, 60.0, np.inf])
 
 @dataclass(frozen=True)
 class Cell:
-    """A subset of the data: a ``dimension`` ("all", "cohort", "window" or "zone") and its ``value``."""
+    """A subset of the data: a ``dimension`` ("all", "cohort", "window" or "zone") and its ``value``.
+
+    ``draw``: number of the random error that was added to its samples; 0: they are as recorded.
+    """
 
     dimension: str
     value: str
+    draw: int = 0
 
 
 ALL = Cell("all", "")
@@ -191,9 +195,34 @@ class VisitSums:
         rows = sorted((person, r) for r, (row_cell, person) in enumerate(self.rows) if row_cell == cell)
         return np.array([r for _, r in rows], np.int64), [person for person, _ in rows]
 
+    def select_draw(self, draw: int) -> VisitSums:
+        """Return the sums of the cells with ``draw``, as those of samples without an added error."""
+        cells = [k for k, cell in enumerate(self.cells) if cell.draw == draw]
+        rows = [k for k, (cell, _) in enumerate(self.rows) if cell.draw == draw]
+        return replace(
+            self,
+            cells=tuple(replace(self.cells[k], draw=0) for k in cells),
+            rows=tuple((replace(self.rows[k][0], draw=0), self.rows[k][1]) for k in rows),
+            **{name: getattr(self, name)[rows] for name in (*_PER_ROW, *_PER_AREA)},
+            **{name: getattr(self, name)[cells] for name in _PER_CELL},
+        )
+
 
 _PER_ROW = ("time", "rays")
 _PER_AREA = ("dwell_time", "distance", "visits", "visible_time", "first_visit_sum", "first_visit_count")
+_PER_CELL = ("duration_counts", "transitions")
+
+
+def join_cells(parts: Sequence[VisitSums]) -> VisitSums:
+    """Return the sums of different cells of the same samples as one."""
+    first, arrays = parts[0], (*_PER_ROW, *_PER_AREA, *_PER_CELL)
+    joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in arrays}
+    return replace(
+        first,
+        cells=tuple(cell for part in parts for cell in part.cells),
+        rows=tuple(row for part in parts for row in part.rows),
+        **joined,
+    )
 
 
 def merge_sums(sums: Iterable[VisitSums]) -> VisitSums:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.aoi import measured
-from nerg_mi.aoi.settings import AoiSampling
+from nerg_mi.aoi.settings import AoiSampling, TrackerError
 from nerg_mi.aoi.statistics import statistics
 from nerg_mi.aoi.statistics_parts import (
     ObserverPoses,
@@ -98,6 +98,13 @@ def test_parallel_tables_equal_serial_tables(place):
     assert [(job.name.partition(" /")[0], job.remaining) for job in account.jobs] == [("nerg stats", 0)] * 3
     assert sorted(job.total for job in account.jobs) == [2, 2, 6]
     assert len(account.jobs[0].changed) == 0
+
+
+def test_parts_add_the_same_errors(place):
+    options = {"error": TrackerError(accuracy=2.0, precision=0.5, draws=2)}
+    whole, _ = count(place, "one", **options)
+    parts, _ = count(place, "two", **options, parallel=Parallel(store=place / "store"))
+    assert parts == whole and "tracker.csv" in parts
 
 
 def test_only_changed_parts_are_recomputed(place):

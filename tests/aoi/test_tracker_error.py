@@ -1,0 +1,179 @@
+"""Tests of `nerg_mi.aoi.tracker_error`: disturbed samples, correction against closed forms, coverage, resolution."""
+
+from __future__ import annotations
+
+from statistics import NormalDist
+
+import numpy as np
+import pytest
+
+from nerg_mi.aoi.settings import TrackerError, VisitRules
+from nerg_mi.aoi.statistics import statistics
+from nerg_mi.aoi.tracker_error import Disturbance, read_validation, turn_directions
+from nerg_mi.errors import NergError
+from nerg_mi.tracking.rays import Rays
+from tests.recorder import Recorder
+
+RULES = VisitRules(min_visit=0.0)
+
+
+def look(horizontal, vertical=None, times=None):
+    """Return rays of participants (P) at the origin, who look at angles (P, N) in degrees from the x axis."""
+    right = np.radians(np.asarray(horizontal, float))
+    up = np.zeros_like(right) if vertical is None else np.radians(vertical)
+    num, count = right.shape
+    directions = np.stack([np.cos(up) * np.cos(right), -np.cos(up) * np.sin(right), np.sin(up)], axis=2)
+    times = np.arange(count) / 10 if times is None else times
+    return Rays.from_arrays(
+        np.zeros((num * count, 3)),
+        directions.reshape(-1, 3),
+        times=np.tile(times, num),
+        participants=np.repeat([f"p{k:04d}" for k in range(num)], count),
+    )
+
+
+def draws_of(rays, error, rules=RULES, by_participant=None):
+    return list(Disturbance(error, by_participant or {}).draw(rays, rules))
+
+
+def angle(a, b):
+    return np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), (a * b).sum(axis=1)))
+
+
+def test_directions_turn_to_the_right_and_up():
+    ahead = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [0.6, 0, -0.8]])
+    angles = np.radians([[30.0, 0], [0, 40], [3, 4], [-50, 20]])
+    turned = turn_directions(ahead, angles)
+    assert np.allclose(turned[0], [np.cos(np.pi / 6), -np.sin(np.pi / 6), 0])
+    assert np.allclose(turned[1], [0, np.cos(np.radians(40)), np.sin(np.radians(40))])
+    assert np.allclose(angle(ahead, turned), np.degrees(np.linalg.norm(angles, axis=1)))
+    assert np.allclose(np.linalg.norm(turned, axis=1), 1)
+
+
+def test_offsets_have_the_accuracy_and_noise_the_precision():
+    rays = look(np.zeros((400, 8)), times=np.r_[0:4, 1000:1004] / 1.0)  # two sessions of each participant
+    offsets = draws_of(rays, TrackerError(accuracy=2.0, draws=4))
+    for level, some in ((1, offsets[:4]), (2, offsets[4:])):
+        angles = np.stack([angle(rays.direction, d.direction) for d in some]).reshape(4, 400, 2, 4)
+        assert np.allclose(angles, angles[..., :1])
+        assert angles.mean() == pytest.approx(2.0 * np.sqrt(level), rel=0.05)
+        assert not np.isclose(angles[..., 0, 0], angles[..., 1, 0]).any()
+    noise = np.stack([angle(rays.direction, d.direction) for d in draws_of(rays, TrackerError(precision=0.5, draws=4))])
+    assert np.sqrt((noise[:4] ** 2).mean()) == pytest.approx(0.5, rel=0.03)
+    assert np.sqrt((noise[4:] ** 2).mean()) == pytest.approx(0.5 * np.sqrt(2), rel=0.03)
+
+
+def test_draws_do_not_depend_on_the_other_sessions():
+    rays = look(np.zeros((3, 8)), times=np.r_[0:4, 1000:1004] / 1.0)
+    error = TrackerError(accuracy=1.0, precision=0.3, draws=2)
+    for rows in (np.arange(8, 16), np.arange(4, 8), np.r_[0:4, 16:24]):
+        some = draws_of(rays.select(rows), error)
+        for part, whole in zip(some, draws_of(rays, error)):
+            assert np.array_equal(part.direction, whole.direction[rows])
+
+
+EDGE = {"right": {"min": [4.9, -50, -50], "max": [5.1, 0, 50]}}
+
+
+def test_correction_matches_the_closed_form():
+    # All look 1.5 degrees to the right of the edge of a wall: the share with an added error of variance v along an axis
+    # is the normal distribution function of 1.5 / sqrt(v).
+    rays = look(np.full((1500, 2), 1.5))
+    result = statistics(rays, EDGE, rules=RULES, error=TrackerError(accuracy=2.0, draws=10), resamples=199)
+    row = next(r for r in result.tracker if r["measure"] == "share")
+    sd = 2.0 * np.sqrt(2 / np.pi)
+    once, twice = (NormalDist(0, sd * np.sqrt(v)).cdf(1.5) for v in (1, 2))
+    assert row["recorded"] == 1 and row["disturbed"] == pytest.approx(once, abs=0.01)
+    assert 3 - 3 * once + twice > 1 and row["corrected"] == 1  # beyond 1, which no share is
+    rays = look(np.repeat(np.linspace(-6, 6, 1500)[:, None], 2, axis=1))
+    result = statistics(rays, EDGE, rules=RULES, error=TrackerError(accuracy=2.0, draws=10), resamples=199)
+    for row in result.tracker:
+        if row["measure"] in ("share", "hit_ratio"):
+            assert row["corrected"] == pytest.approx(0.5, abs=0.01) and row["low"] < 0.5 < row["high"]
+
+
+def simulate(rng, shares, num, count, spread, sd, noise):
+    """Return true and recorded angles (P, N, 2) in degrees; the columns of a wall, each 3 degrees wide, get
+    ``shares``."""
+    true, recorded = np.empty((num, count, 2)), np.empty((num, count, 2))
+    for p in range(num):
+        column = rng.choice(len(shares), count, p=rng.dirichlet(30 * shares))
+        true[p] = np.c_[3 * (column - len(shares) / 2 + 0.5) + rng.uniform(-1, 1, count) * spread, np.zeros(count)]
+        recorded[p] = true[p] + rng.normal(0, sd, 2) + rng.normal(0, noise, (count, 2))
+    return true, recorded
+
+
+@pytest.mark.slow
+def test_intervals_cover_the_true_shares():
+    rng, error = np.random.default_rng(1), TrackerError(accuracy=1.2, precision=0.3, draws=8)
+    num_areas, edges = 6, np.tan(np.radians(np.arange(-9, 10, 3)))
+    walls = {f"column {k}": {"min": [0.99, -edges[k + 1], -5], "max": [1.0, -edges[k], 5]} for k in range(num_areas)}
+    covered, naive = [], []
+    for _ in range(30):
+        shares = rng.dirichlet(np.ones(num_areas))
+        scale = 1.2 * np.sqrt(2 / np.pi), 0.3 / np.sqrt(2)
+        angles = simulate(rng, shares, 20, 40, 1.5, *scale)[1]
+        result = statistics(look(angles[..., 0], angles[..., 1]), walls, rules=RULES, error=error, resamples=199)
+        rows = [r for r in result.tracker if r["measure"] == "share"]
+        listed = [(r, share, a) for r, share, a in zip(rows, shares, result.aois) if r["low"] is not None]
+        covered += [r["low"] <= share <= r["high"] for r, share, _ in listed]
+        naive += [a["share_low"] <= share <= a["share_high"] for _, share, a in listed]
+    assert 0.9 < np.mean(covered) < 0.99 and np.mean(naive) < 0.8
+
+
+def test_small_areas_and_close_neighbours_are_named():
+    areas = {
+        "page": {"min": [1.99, -0.5, -0.01], "max": [2.0, 0.5, 0.01]},  # .57 degrees high, 28 wide
+        "door": {"min": [1.99, 0.6, -1.0], "max": [2.0, 1.6, 1.0]},
+        "sign": {"min": [1.99, -0.5, 0.06], "max": [2.0, 0.5, 0.4]},
+    }
+    result = statistics(look(np.zeros((3, 4))), areas, rules=RULES, error=TrackerError(accuracy=4.0), resamples=199)
+    rows = {(r["aoi"], r["neighbour"]): r["extent"] for r in result.resolution}
+    assert set(rows) == {("page", ""), ("page", "sign")}
+    assert rows["page", ""] == pytest.approx(np.degrees(2 * np.arctan(0.01 / 2)), rel=0.05)
+    assert rows["page", "sign"] == pytest.approx(np.degrees(np.arctan(0.23 / 2)), rel=0.1)
+
+
+def test_a_table_replaces_the_error_of_participants(tmp_path):
+    file = tmp_path / "validation.csv"
+    file.write_text("participant,accuracy,precision\np0001,3,0\np0001,1,0\n")
+    assert read_validation(file) == {"p0001": (2.0, 0.0)}
+    file.write_text("participant,std,accuracy\na,0.2,1\nb,,1\nc,0.2,\n")  # a table of data quality
+    assert read_validation(file) == {"a": (1.0, 0.2), "b": (1.0, pytest.approx(np.nan, nan_ok=True))}
+    file.write_text("participant,accuracy,precision\np0001,3,0\np0001,1,0\n")
+    rays = look(np.zeros((2, 4)))
+    some = draws_of(rays, TrackerError(draws=2), by_participant=read_validation(file))
+    moved = angle(rays.direction, some[0].direction)
+    assert (moved[:4] == 0).all() and (moved[4:] > 0).all()
+    recorder = Recorder()
+    result = statistics(rays, EDGE, rules=RULES, validation=file, resamples=199, progress=recorder)
+    assert result.tracker and any('"p0000"' in text for text in recorder.warnings)
+    for text in (
+        "person,accuracy,precision\np0001,21,0\n",
+        "person,accuracy,precision\np0001,-1,0\n",
+        "person,precision\na,1\n",
+        "person,accuracy\na,\n",
+    ):
+        file.write_text(text)
+        with pytest.raises(NergError):
+            statistics(rays, EDGE, rules=RULES, validation=file, resamples=199)
+
+
+def test_without_an_error_nothing_is_added():
+    result = statistics(look(np.zeros((3, 4))), EDGE, rules=RULES, resamples=199)
+    assert not result.tracker and not result.resolution
+    disturbed = statistics(look(np.zeros((3, 4))), EDGE, rules=RULES, error=TrackerError(accuracy=1.0), resamples=199)
+    assert result.aois == disturbed.aois and result.transitions == disturbed.transitions
+
+
+def test_participants_below_the_minimum_are_suppressed():
+    rays = look(np.zeros((3, 4)))
+    result = statistics(rays, EDGE, rules=RULES, error=TrackerError(accuracy=1.0), resamples=199, min_participants=4)
+    assert all(r["corrected"] is None and r["recorded"] is None and r["note"] for r in result.tracker)
+
+
+def test_values_without_a_visit_have_a_note():
+    rays = look(np.full((4, 4), -60.0))
+    result = statistics(rays, EDGE, rules=RULES, error=TrackerError(accuracy=1.0), resamples=199)
+    (row,) = [r for r in result.tracker if r["measure"] == "time_to_first_visit"]
+    assert row["corrected"] is None and row["note"]
