@@ -193,6 +193,7 @@ def main(argv=None) -> None:
     each: list[dict] = []
     unsure: list[dict] = []
     kinds: list[dict] = []
+    regions: list[dict] = []
     for name, make in parse_environments(args).items():
         result = evaluate(name, make, args)
         each += [
@@ -201,6 +202,7 @@ def main(argv=None) -> None:
         ]
         unsure += uncertainty(name, result)
         kinds += [{"place": name, **row} for row in result.verdicts]
+        regions += [{"place": name, **row} for row in result.calibration]
     write_csv(args.out / "folds.csv", each)
     seeds = ", ".join(map(str, range(args.seed, args.seed + args.folds)))
     if args.uncertainty:
@@ -209,6 +211,7 @@ def main(argv=None) -> None:
     save_places(args.result, each, seeds)
     save_methods(f"{args.result}-methods", each, seeds)
     save_kinds(f"{args.result}-kinds", kinds, seeds)
+    save_regions(f"{args.result}-regions", regions, seeds)
     if args.against is not None:
         show_change(each, args.against)
 
@@ -329,6 +332,20 @@ def save_kinds(name: str, rows: list[dict], seeds: str) -> None:
         )
     head = ("scene", "positions", "field", "best baseline", "its value", "field minus best baseline", "by fold")
     save_result(name, head, table, seeds)
+
+
+def save_regions(name: str, rows: list[dict], seeds: str) -> None:
+    """Fractions of the held-out rays in regions of the field at recorded and at new positions, means over folds."""
+    from nerg_mi.evaluation.position_scores import AWAY, RECORDED
+
+    by, levels, table = {(row["place"], row["method"]): row for row in rows}, ("50%", "80%", "95%"), []
+    for place in dict.fromkeys(row["place"] for row in rows):
+        for kind in (RECORDED, AWAY):
+            methods = f"{OURS}, {kind}", f"{OURS}, {kind}, calibrated"
+            cells = [f"{100 * by[place, method][level]:.0f}" for method in methods for level in levels]
+            table.append([place, kind, *cells])
+    head = [*(f"{level[:-1]} %" for level in levels), *(f"{level[:-1]} %, calibrated" for level in levels)]
+    save_result(name, ("scene", "positions", *head), table, seeds)
 
 
 def uncertainty(name: str, result) -> list[dict]:

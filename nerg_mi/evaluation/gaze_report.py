@@ -129,7 +129,8 @@ def format_uncertainty(ranks: list[dict], regions: list[dict]) -> str:
     if regions:
         text += (
             "## Calibration\n\nFraction of the held-out samples inside the highest-density regions of each nominal "
-            'level; "calibrated": with levels calibrated on the training folds.'
+            "level, at the centres of the test positions, and at the origins of samples at recorded and at new "
+            'positions; "calibrated": with levels calibrated on the training folds.'
             f"\n\n{format_table(regions, ('method', *(format_level(level) for level in REGION_LEVELS)))}\n"
         )
     return text

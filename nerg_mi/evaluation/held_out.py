@@ -44,8 +44,8 @@ from .baselines import (
 from .baselines import PRIOR as PRIOR_BASELINE
 from .gaze import EPS, SCORES, SPLIT_HALF, FieldDensity
 from .gaze_report import draw_comparison, explain_missing, write_report
-from .position_scores import AWAY, RECORDED, format_verdicts, score_kinds
-from .uncertainty import correlate_uncertainty, measure_calibration, score_positions
+from .position_scores import AWAY, RECORDED, format_verdicts, iter_region_levels, score_kinds
+from .uncertainty import correlate_uncertainty, measure_calibration, measure_coverage, score_positions
 
 _FIELD = "gaze field"  # Name of the method that is compared with the baselines
 # Methods that are scored for each participant, those that are drawn, and those whose highest-density regions are
@@ -243,7 +243,8 @@ def evaluate_gaze(
             reporter.message(f"the split half is not shown: {half_note}")
         reporter.progress(0.85, "recorded and new positions")
         density = FieldDensity(loaded.network, opened.medium, opened.align, depth)
-        verdicts = _score_kinds(data, train, account, split, density, baselines, tune, seed)
+        held_out = _select_all_held_out(data, account)
+        verdicts = _score_kinds(train, held_out, account, split, density, baselines, tune, seed)
         reporter.progress(0.88, "participants")
         select = lambda names: {name: methods[name] for name in names if name in methods}
         persons = evaluation.score_participants(test, select(_BY_PERSON), prior, min_rays)
@@ -254,6 +255,9 @@ def evaluate_gaze(
         calibrated = {k: (m(test.centres, test.directions), at(m)) for k, m in select(_CALIBRATED).items()}
         stored = training.get("mix", {}).get("regions")
         regions = measure_calibration(test, calibrated, resamples, seed, {_FIELD: stored} if stored else None)
+        for kind, levels, of_kind in iter_region_levels(train, held_out, density.evaluate_rays, seed):
+            people, person = np.unique(of_kind.person, return_inverse=True)
+            regions += measure_coverage(f"{_FIELD}, {kind}", levels, person, len(people), resamples, seed, stored)
         for table in (rows, persons, places, ranks, regions, verdicts):
             add_notes(table, explain_missing)
         numbers = len(train), len(data), account["radius"], kappa, directions, resamples
@@ -291,9 +295,17 @@ def evaluate_gaze(
     return result
 
 
+def _select_all_held_out(rays: Rays, account: dict) -> Rays:
+    """Select all rays of the held-out participants, or, if none were held out, rays of the training participants at the
+    held-out positions."""
+    if account.get("people"):
+        return rays.select(split_by_person(rays, test_persons=account["people"])[1])
+    return rays.select(~purge(rays, np.array(account["centres"]), account["radius"]))
+
+
 def _score_kinds(
-    rays: Rays,
     train: Rays,
+    held_out: Rays,
     account: dict,
     split: str,
     density: Baseline,
@@ -301,13 +313,8 @@ def _score_kinds(
     tune: Callable[..., Mapping[str, TunedBaseline]],
     seed: int,
 ) -> list[dict[str, Any]]:
-    """Score the field at recorded positions and away from them, on all rays of the held-out participants, or, if none
-    were held out, on rays of the training participants at the held-out positions. The ``baselines`` are those tuned
-    for the ``split``, and ``tune`` makes others."""
-    if account.get("people"):
-        held_out = rays.select(split_by_person(rays, test_persons=account["people"])[1])
-    else:
-        held_out = rays.select(~purge(rays, np.array(account["centres"]), account["radius"]))
+    """Score the field at recorded positions and away from them. The ``baselines`` are those tuned for the ``split``,
+    and ``tune`` makes others."""
     tuned_for = {"people": RECORDED, "both": AWAY}.get(split)
 
     def tune_for(kind: str) -> dict[str, Baseline]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -10,13 +10,38 @@ from scipy.spatial import KDTree
 from scipy.stats import t as student
 
 from nerg_mi.tracking.folds import NEW_POSITION_DISTANCE, sample_participants_equally
+from nerg_mi.tracking.probes import compute_region_levels
 from nerg_mi.tracking.rays import Rays
+from nerg_mi.train.gaze_data import make_rotated_directions
 
 from .baselines import PRIOR, Baseline
 
 RECORDED, AWAY = "recorded positions", "new positions"
 """Kinds of positions: up to `NEW_POSITION_DISTANCE` from the nearest training ray, and farther away from all."""
 _MAX_RAYS = 256  # Rays of each kind, with about as many of each participant
+# The same for the levels of regions, and directions around each ray, because all of them are evaluated
+_MAX_REGION_RAYS, _NUM_DIRECTIONS = 128, 512
+
+
+def iter_kinds(train: Rays, held_out: Rays, count: int, seed: int = 0) -> Iterator[tuple[str, Rays]]:
+    """Yield each kind of positions with rays, and at most ``count`` of the ``held_out`` rays there."""
+    is_new = KDTree(train.origin).query(held_out.origin)[0] > NEW_POSITION_DISTANCE
+    for kind, mask in ((RECORDED, ~is_new), (AWAY, is_new)):
+        if mask.any():
+            yield kind, sample_participants_equally(held_out.select(mask), count, seed)
+
+
+def iter_region_levels(
+    train: Rays, held_out: Rays, evaluate_rays: Callable[..., np.ndarray], seed: int = 0
+) -> Iterator[tuple[str, np.ndarray, Rays]]:
+    """Yield each kind of positions, the levels of the highest-density regions that contain rays there (n,), each for an
+    observer at its own origin, and the rays. ``evaluate_rays`` is that of `gaze.FieldDensity`."""
+    for kind, rays in iter_kinds(train, held_out, _MAX_REGION_RAYS, seed):
+        around = make_rotated_directions(_NUM_DIRECTIONS, len(rays), np.random.default_rng(seed))
+        directions = np.concatenate([around, rays.direction[:, None]], axis=1)
+        origins = np.repeat(rays.origin, directions.shape[1], axis=0)
+        density = evaluate_rays(origins, directions.reshape(-1, 3)).reshape(len(rays), -1)
+        yield kind, compute_region_levels(density[:, :-1], density[:, -1:])[:, 0], rays
 
 
 def score_kinds(
@@ -43,11 +68,7 @@ def score_kinds(
         95 % intervals of Student's t over participants, if there are at least three.
     """
     rows = []
-    is_new = KDTree(train.origin).query(held_out.origin)[0] > NEW_POSITION_DISTANCE
-    for kind, mask in ((RECORDED, ~is_new), (AWAY, is_new)):
-        if not mask.any():
-            continue
-        rays = sample_participants_equally(held_out.select(mask), _MAX_RAYS, seed)
+    for kind, rays in iter_kinds(train, held_out, _MAX_RAYS, seed):
         # The same arrays for all, so that baselines which share a density evaluate it once.
         baselines, at = tune(kind), (rays.origin, rays.direction[:, None])
         evaluate = lambda method, at=at: _log_bits(method(*at)[:, 0])

@@ -150,27 +150,42 @@ def measure_calibration(
         A row per method: the fraction of the rays in the regions of each of `REGION_LEVELS`, with ``.low`` and
         ``.high`` if there are three participants.
     """
-    rng, num_participants = np.random.default_rng(seed), len(test.participants)
-    draws = rng.multinomial(
+    who, count, out = test.sample_participants, len(test.participants), []
+    for name, (maps, at) in methods.items():
+        levels = compute_region_levels(maps, at)
+        out += measure_coverage(name, levels, who, count, resamples, seed, (calibrated or {}).get(name))
+    return out
+
+
+def measure_coverage(
+    name: str,
+    levels: np.ndarray,
+    participants: np.ndarray,
+    num_participants: int,
+    resamples: int = 200,
+    seed: int = 0,
+    calibrated: Mapping[str, float] | None = None,
+) -> list[dict[str, Any]]:
+    """Measure the coverage of highest-density regions from the ``levels`` of rays (`compute_region_levels`) and their
+    ``participants``, indices of the same shape.
+
+    Returns a row of the method ``name`` as `measure_calibration`, and another one if it has ``calibrated`` levels.
+    """
+    draws = np.random.default_rng(seed).multinomial(
         num_participants, np.full(num_participants, 1 / num_participants), resamples if num_participants >= 3 else 0
     )
     out = []
-    for name, (maps, at) in methods.items():
-        level = compute_region_levels(maps, at)
-        rows: dict[str, Mapping[str, float] | None] = {name: None}
-        if calibrated and name in calibrated:
-            rows[f"{name}, calibrated"] = calibrated[name]
-        for title, level_map in rows.items():
-            row: dict[str, Any] = {"method": title}
-            for coverage in REGION_LEVELS:
-                is_inside, key = level <= get_calibrated_level(coverage, level_map), format_level(coverage)
-                row[key] = float(is_inside.mean())
-                if len(draws):
-                    weights = [times[test.sample_participants] for times in draws]
-                    weights = [w for w in weights if w.any()]
-                    half_width = 1.96 * np.std([(is_inside * w).sum() / w.sum() for w in weights])
-                    row[f"{key}.low"], row[f"{key}.high"] = row[key] - half_width, row[key] + half_width
-            out.append(row)
+    for title, level_map in ((name, None), (f"{name}, calibrated", calibrated))[: 1 if calibrated is None else 2]:
+        row: dict[str, Any] = {"method": title}
+        for coverage in REGION_LEVELS:
+            is_inside, key = levels <= get_calibrated_level(coverage, level_map), format_level(coverage)
+            row[key] = float(is_inside.mean())
+            if len(draws):
+                weights = [times[participants] for times in draws]
+                weights = [w for w in weights if w.any()]
+                half_width = 1.96 * np.std([(is_inside * w).sum() / w.sum() for w in weights])
+                row[f"{key}.low"], row[f"{key}.high"] = row[key] - half_width, row[key] + half_width
+        out.append(row)
     return out
 
 

@@ -79,6 +79,8 @@ def test_scores_are_listed_with_the_baselines(trained, tmp_path):
     assert [row["bits"] for row in result.verdicts if row["method"] == PRIOR] == [0]
     # Calibrated on the data that the folds of the training held out.
     assert result.calibration[1]["method"] == "gaze field, calibrated"
+    # At the test positions, and at the origins of all held-out rays.
+    assert result.calibration[-1]["method"] == "gaze field, new positions, calibrated"
     data = json.loads((tmp_path / "eval" / "gaze.json").read_text())
     assert data["methods"][0]["KLD"] == result.rows[0]["KLD"] and data["tracking"] == result.tracking
     text = (tmp_path / "eval" / "gaze.md").read_text()

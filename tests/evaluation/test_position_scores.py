@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 from nerg_mi.evaluation.baselines import PRIOR
-from nerg_mi.evaluation.position_scores import AWAY, RECORDED, find_best, format_verdicts, score_kinds
+from nerg_mi.evaluation.position_scores import (
+    AWAY,
+    RECORDED,
+    find_best,
+    format_verdicts,
+    iter_region_levels,
+    score_kinds,
+)
+from nerg_mi.maths.sphere import sample_uniform_directions
 from nerg_mi.tracking.rays import Rays
 
 
@@ -68,3 +76,26 @@ def test_intervals_are_those_of_participants():
     assert (
         "bits.low" not in score_kinds(train, people(2, 30, 0.0), constant(0.1), lambda kind: {PRIOR: constant(0.1)})[0]
     )
+
+
+def test_levels_of_regions_are_those_of_each_ray_at_its_origin():
+    """The smallest region with a ray of a von Mises-Fisher density is a cap around its mean, which differs by kind."""
+    train, near, far = people(3, 50, 0.0), people(2, 60, 0.0), people(2, 60, 2.0)
+    directions = sample_uniform_directions(240, np.random.default_rng(0))
+    held_out = Rays(
+        np.arange(240.0),
+        np.concatenate([near.person, far.person]),
+        near.persons,
+        np.concatenate([near.origin, far.origin]),
+        directions,
+        np.ones(240),
+    )
+    axis = lambda origins: np.where(origins[:, :1] > 1, [[1.0, 0, 0]], [[0, 0, 1.0]])
+    cosine = lambda origins, directions: np.sum(axis(origins) * directions, axis=1)
+    field = lambda origins, directions: np.exp(4 * cosine(origins, directions))
+    levels = {kind: (values, rays) for kind, values, rays in iter_region_levels(train, held_out, field)}
+    assert list(levels) == [RECORDED, AWAY]
+    for values, rays in levels.values():
+        mass = -np.expm1(4 * (cosine(rays.origin, rays.direction) - 1)) / -np.expm1(-8.0)
+        assert len(values) == 120 and np.ptp(mass) > 0.8
+        np.testing.assert_allclose(values, mass, atol=0.02)
