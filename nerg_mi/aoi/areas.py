@@ -7,7 +7,8 @@ An entry of ``regions`` has a ``name`` and
   counter-clockwise seen from above, or a quaternion x, y, z, w;
 - or ``mesh``, a file in the folder of the JSON file or below, and optionally ``faces``: numbers from 0, or pairs of
   a first and a last one;
-- or ``shape``, the id of a shape of the scene;
+- or ``shape``, the id of a shape of the scene, or a pattern with ``*`` or ``?``: each shape that matches is an area
+  under its own id, and together they form a group. ``--aois "mesh:book*"`` takes the shapes that match, without a file;
 - or ``parts``, the names of the entries of a group;
 - or ``adt``, the folder of an Aria Digital Twin recording, and optionally ``categories``, such as ``["chair"]``: its
   static objects, each a rotated box in the frame of samples that were imported with ``--preset aria``. With a
@@ -18,6 +19,7 @@ Coordinates are those of the environment.
 
 from __future__ import annotations
 
+import fnmatch
 import json
 import os
 import shutil
@@ -51,6 +53,7 @@ from nerg_mi.formats.boxes import (
 )
 from nerg_mi.formats.meshes import MeshFile
 
+SHAPES_PREFIX = "mesh:"  # of a pattern of shapes in place of a file
 MAX_GROUP_DEPTH = 100  # maximum nesting depth of groups
 MESH_SUFFIXES = (".ply", ".obj")  # suffixes of meshes with areas
 MAX_PARTS = 1000  # maximum number of face ranges, parts of a group, or categories of an area
@@ -86,10 +89,15 @@ class MeshPart:
 
 @dataclass(frozen=True)
 class SceneShape:
-    """The shape of the scene with the id ``shape``."""
+    """The shape of the scene with the id ``shape``, or those whose ids match it (`Areas.match_shapes`)."""
 
     name: str
     shape: str
+
+    @property
+    def is_pattern(self) -> bool:
+        """Whether ``shape`` stands for several shapes."""
+        return "*" in self.shape or "?" in self.shape
 
 
 @dataclass(frozen=True)
@@ -155,7 +163,8 @@ class Areas:
         ----------
         source : path or mapping
             A JSON file (see the module), the folder of a recording of Aria Digital Twin, whose static objects become
-            boxes, or areas by name: boxes (two corners in any order), meshes of trimesh, and dicts as in the file.
+            boxes, areas by name: boxes (two corners in any order), meshes of trimesh, and dicts as in the file; or
+            ``"mesh:PATTERN"``, the shapes of the scene whose ids match, as in ``"mesh:book*"``.
         name : str
             Name of the argument in messages.
 
@@ -178,6 +187,9 @@ class Areas:
                 f"{parameter(name)} must be a dict of areas by name or a file, given as a string or a path, got "
                 f"{type(source).__name__}"
             )
+        if (text := str(source)).startswith(SHAPES_PREFIX):
+            pattern = text.removeprefix(SHAPES_PREFIX)
+            return cls((SceneShape(pattern, normalize_name(pattern)),))
         path = Path(source)
         if path.is_dir():
             return cls(tuple(read_twin_objects(path)), path, tuple(list_twin_files(path)))
@@ -197,6 +209,26 @@ class Areas:
             label = parameter(name) if opened.path is None else f'"{opened.path}"'
             raise NergError(f"{label} contains no box; draw one in the viewer, or write {EXAMPLE}")
         return opened.boxes
+
+    def match_shapes(self, ids: Iterable[str]) -> Areas:
+        """Return areas in which each shape of the scene with one of ``ids`` that matches a pattern is an area.
+
+        Those of an entry with another name than its pattern also form a group. A pattern that is an id is no pattern.
+        Raises `NergError` for a pattern that nothing matches, and as the class.
+        """
+        ids, areas = list(ids), list[Area]()
+        for area in self.areas:
+            if not isinstance(area, SceneShape) or not area.is_pattern or area.shape in ids:
+                areas.append(area)
+                continue
+            matches = tuple(fnmatch.filter(ids, area.shape))
+            if not matches:
+                remedy = f"its shapes are {', '.join(ids[:20])}" if ids else "use a scene with shapes"
+                raise NergError(f'no shape of the scene matches "{sanitize(area.shape, 40)}"; {remedy}')
+            areas += [SceneShape(name, name) for name in matches if name not in [a.name for a in areas]]
+            if area.name != area.shape:
+                areas.append(AreaGroup(area.name, matches))
+        return replace(self, areas=tuple(areas))
 
     def save(self, path: FilePath) -> Path:
         """Write a JSON file atomically. Meshes in memory or outside of its folder are written to the folder

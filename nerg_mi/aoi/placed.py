@@ -515,6 +515,7 @@ def place_areas(
     doubts: tuple[str, ...] = (),
 ) -> PlacedAreas:
     """Place ``areas`` in an environment, see `PlacedAreas`. Raises `NergError` for unknown shapes and faces."""
+    areas = areas.match_shapes(environment.shapes)
     aois = make_aois(areas.elements, environment.shapes, meshes, environment.scene_geometry.scene)
     return PlacedAreas(environment, sampler, areas, aois, meshes, sampling, doubts)
 

@@ -207,7 +207,7 @@ def statistics(
     )
     files = existing_files(chosen.environment, chosen.gaze, chosen.rays, areas.path, what_if)
     plain = {
-        "aois": areas.path,
+        "aois": areas.path or (str(aois) if isinstance(aois, (str, os.PathLike)) else None),
         "zones": zones.path if isinstance(zones, Areas) else zones,
         "what_if": what_if,
         "align": align,

@@ -312,8 +312,16 @@ def _open_mesh_file(path: Path, keep_shapes: bool) -> Environment:
     import mitsuba as mi
 
     mesh = read_mesh_file(path)
+    parts = mesh.split_parts() if keep_shapes else {}
+    shapes = {"mesh": make_mesh(mesh.vertices, mesh.faces, "mesh")}
+    if len(parts) > 1:
+        used = {name: np.unique(faces, return_inverse=True) for name, faces in parts.items()}
+        shapes = {name: make_mesh(mesh.vertices[v], k.reshape(-1, 3), name) for name, (v, k) in used.items()}
     with translate_mitsuba_errors(path):
-        scene = mi.load_dict({"type": "scene", "mesh": make_mesh(mesh.vertices, mesh.faces, "mesh")})
+        # Names with dots are no keys of a dict of Mitsuba.
+        scene = mi.load_dict({"type": "scene"} | {f"shape_{k}": shape for k, shape in enumerate(shapes.values())})
+    for shape, name in zip(shapes.values(), shapes):
+        shape.set_id(name)
     return replace(_open_scene(scene, f'the scene "{path}"'), notes=mesh.notes)
 
 

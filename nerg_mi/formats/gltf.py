@@ -172,12 +172,15 @@ class GltfTriangles:
         Linear vertex colours (V, 3) in 0..1, or None.
     notes
         Sentences about parts of the file that are not used.
+    parts
+        Name of each node with triangles, and the index of its first one.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
     colors: np.ndarray | None = None
     notes: tuple[str, ...] = ()
+    parts: tuple[tuple[str, int], ...] = ()
 
 
 def parse_glb(raw: bytes | memoryview, path: str | os.PathLike) -> GltfTriangles:
@@ -196,13 +199,15 @@ def parse_glb(raw: bytes | memoryview, path: str | os.PathLike) -> GltfTriangles
         faces: list[np.ndarray] = []
         count = triangles = 0
         cached: dict[tuple, tuple[np.ndarray, np.ndarray]] = {}
-        for primitive, matrix in primitives:
+        parts: list[tuple[str, int]] = []
+        for primitive, matrix, name in primitives:
             if "KHR_draco_mesh_compression" in primitive.get("extensions", {}):
                 raise ValueError("its triangles are compressed (Draco); export it without compression")
             key = primitive["attributes"]["POSITION"], primitive.get("indices"), primitive.get("mode", _TRIANGLES)
             if key not in cached:
                 cached[key] = _read_triangles(document, data, *key, _QUANTIZED if quantized else _FLOATS)
             corners, index = cached[key]
+            parts.append((name, triangles))
             triangles += len(index)
             if triangles > MAX_TRIANGLES:
                 raise ValueError(f"it has more than the {MAX_TRIANGLES:,} triangles, the limit")
@@ -216,8 +221,8 @@ def parse_glb(raw: bytes | memoryview, path: str | os.PathLike) -> GltfTriangles
         vertex_colors = None
         if any(part is not None for part in colors):
             vertex_colors = np.concatenate([np.ones((len(v), 3)) if c is None else c for v, c in zip(vertices, colors)])
-        notes = _describe_unused(document, [primitive for primitive, _ in primitives])
-        return GltfTriangles(np.concatenate(vertices), np.concatenate(faces), vertex_colors, notes)
+        notes = _describe_unused(document, [primitive for primitive, _, _ in primitives])
+        return GltfTriangles(np.concatenate(vertices), np.concatenate(faces), vertex_colors, notes, tuple(parts))
 
 
 def _check_extensions(document: dict[str, Any]) -> None:
@@ -288,8 +293,9 @@ def _get(document: dict[str, Any], kind: str, index: int) -> dict[str, Any]:
     return entries[index]
 
 
-def iter_instances(document: dict[str, Any], *modes: int) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
-    """Iterate over the primitives of the scene with one of these ``modes``, each with the matrix (4, 4) of its node."""
+def iter_instances(document: dict[str, Any], *modes: int) -> Iterator[tuple[dict[str, Any], np.ndarray, str]]:
+    """Iterate over the primitives of the scene with one of these ``modes``, each with the matrix (4, 4) of its node and
+    its name: that of the node, or of the mesh."""
     roots = range(len(document.get("nodes", [])))
     if document.get("scenes"):
         roots = _get(document, "scenes", document.get("scene", 0)).get("nodes", [])
@@ -304,9 +310,10 @@ def iter_instances(document: dict[str, Any], *modes: int) -> Iterator[tuple[dict
         to_scene = parent @ _read_node_matrix(node)
         pending += [(k, to_scene, depth + 1) for k in reversed(node.get("children", []))]
         if "mesh" in node:
-            for primitive in _get(document, "meshes", node["mesh"])["primitives"]:
+            mesh = _get(document, "meshes", node["mesh"])
+            for primitive in mesh["primitives"]:
                 if primitive.get("mode", _TRIANGLES) in modes:
-                    yield primitive, to_scene
+                    yield primitive, to_scene, str(node.get("name") or mesh.get("name") or "")
 
 
 def _read_node_matrix(node: dict[str, Any]) -> np.ndarray:

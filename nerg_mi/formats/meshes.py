@@ -27,6 +27,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError, sanitize
 from nerg_mi.files.safe_read import check_regular_file, map_bytes, measure_byte_order_mark, translate_read_errors
+from nerg_mi.files.values import normalize_name
 from nerg_mi.maths.color import decode_srgb
 from nerg_mi.maths.coordinates import check_near_origin
 
@@ -81,6 +82,8 @@ class MeshFile:
         Whether Mitsuba would ignore the colours; it cannot texture colours with an alpha channel.
     encodes_colors
         Whether the colours in the file are sRGB values, which Mitsuba would treat as linear.
+    parts
+        Name of each node, object or group, and the index of its first face in the file.
     """
 
     vertices: np.ndarray
@@ -93,6 +96,14 @@ class MeshFile:
     unreadable_reason: str = ""
     hides_colors: bool = False
     encodes_colors: bool = False
+    parts: tuple[tuple[str, int], ...] = ()
+
+    def split_parts(self) -> dict[str, np.ndarray]:
+        """Return the faces (F, 3) of each part by its name; those without a name are "mesh"."""
+        labels = ["mesh", *(normalize_name(name) or "mesh" for name, _ in self.parts)]
+        names, number = np.unique(labels, return_inverse=True)
+        part = number[np.searchsorted([start for _, start in self.parts], self.polygons, side="right")]
+        return {str(names[k]): self.faces[part == k] for k in np.unique(part)}
 
     @property
     def is_readable_by_mitsuba(self) -> bool:
@@ -361,6 +372,7 @@ class _ObjStatements:
         self.vertex_extras: dict[int, list[bytes]] = {}
         self.corners: list[np.ndarray] = []
         self.counts: list[int] = []
+        self.parts: list[tuple[str, int]] = []
         self.unused_statements: dict[bytes, None] = {}
         self.unreadable_reason = ""
 
@@ -392,6 +404,8 @@ class _ObjStatements:
                 tokens += words[1:]
                 counts.append(len(words) - 1)
                 before.append(self.count)
+            elif kind in (b"o", b"g"):
+                self.parts.append((b" ".join(words[1:]).decode("utf-8", "replace"), len(self.counts) + len(counts)))
             elif kind == b"vn":
                 if len(words) < 4:
                     raise ValueError(f"line {number:,}: a normal has fewer than three components")
@@ -553,6 +567,7 @@ def _read_obj(path: str | os.PathLike) -> MeshFile:
         tuple(notes),
         obj.unreadable_reason,
         hides_colors=colors is not None,
+        parts=tuple(obj.parts),
     )
 
 
@@ -569,6 +584,7 @@ def _read_glb(path: str | os.PathLike) -> MeshFile:
         triangles.colors,
         notes=triangles.notes,
         unreadable_reason="it is glTF",
+        parts=triangles.parts,
     )
 
 

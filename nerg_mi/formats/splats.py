@@ -106,7 +106,7 @@ def read_gltf_splats(path: str | os.PathLike) -> Splats:
     with translate_read_errors(path, "splat file", "export it again"):
         document, data = read_glb_chunks(raw, path, "splat file")
         parts = []
-        for primitive, matrix in iter_instances(document, _POINTS):
+        for primitive, matrix, _ in iter_instances(document, _POINTS):
             extension = primitive.get("extensions", {}).get(EXTENSION)
             if extension is None:
                 continue

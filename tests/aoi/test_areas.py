@@ -10,9 +10,12 @@ import trimesh
 from nerg_mi.scenes.store import SCENE_FILE
 
 from nerg_mi.aoi.areas import AreaGroup, Areas, MeshPart, SceneShape, format_areas
+from nerg_mi.aoi.settings import VisitRules
+from nerg_mi.aoi.statistics import statistics
 from nerg_mi.errors import NergError
 from nerg_mi.formats.boxes import MAX_AREAS, Region
 from nerg_mi.formats.meshes import read_mesh_file
+from nerg_mi.tracking.rays import Rays
 from tests.formats.test_boxes import write_twin
 
 # ---- Kinds of areas, and resolution of groups ----
@@ -35,6 +38,34 @@ def test03_nested_groups_are_resolved_once():
     # Both groups contain all previous ones; without caching, the run time would be exponential.
     groups = [AreaGroup("g0", ("a", "b"))] + [AreaGroup(f"g{k}", (f"g{k - 1}", "a")) for k in range(1, 7)]
     assert Areas((A, B, *groups)).element_indices()["g6"] == (0, 1)
+
+
+# ---- Patterns of shapes ----
+
+
+def test_patterns_match_the_shapes_of_the_scene():
+    ids = ["book 1", "book 2", "door", "a*"]
+    assert Areas.load("mesh:book*").match_shapes(ids).names == ("book 1", "book 2")
+    areas = Areas((SceneShape("books", "book ?"), SceneShape("star", "a*"), SceneShape("all", "*oo*")))
+    resolved = areas.match_shapes(ids)
+    assert resolved.names == ("book 1", "book 2", "books", "star", "door", "all")
+    assert resolved.element_indices()["books"] == (0, 1) and resolved.element_indices()["all"] == (0, 1, 3)
+    for ids in (["door"], []):
+        with pytest.raises(NergError):
+            areas.match_shapes(ids)
+
+
+def test_nodes_of_a_mesh_are_areas(tmp_path):
+    scene = trimesh.Scene()
+    for name, right in (("book red", -0.5), ("book blue", 0.5), ("door", 3.0)):
+        # The y axis of glTF is up, and its z axis points away from positive y.
+        box = trimesh.creation.box((0.1, 0.8, 0.8)).apply_translation((2, 1.5, right))
+        scene.add_geometry(box, node_name=name, geom_name=name)
+    scene.export(tmp_path / "room.glb")
+    aims = np.array([[2, -0.5, 1.5], [2, 0.5, 1.5], [2, 0.6, 1.5], [2, -3, 1.5]]) - (0, 0, 1.5)
+    rays = Rays.from_arrays(np.tile((0, 0, 1.5), (4, 1)), aims, times=np.arange(4) / 5, tracking="eye")
+    rows = statistics([rays, tmp_path / "room.glb"], "mesh:book*", rules=VisitRules(min_visit=0.0), resamples=199).aois
+    assert {row["aoi"]: row["share"] for row in rows} == pytest.approx({"book red": 0.5, "book blue": 0.25})
 
 
 # ---- Files with all kinds of areas of interest ----

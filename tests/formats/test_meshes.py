@@ -532,6 +532,32 @@ def test_trimesh_reads_written_glb(tmp_path):
     assert all(view["byteOffset"] % 4 == 0 for view in document["bufferViews"])
 
 
+def test_parts_have_the_names_of_nodes_and_objects(tmp_path):
+    scene = trimesh.Scene()
+    for name, offset in (("book.1", 0), ("book.2", 2), ("door", 4)):
+        box = trimesh.creation.box((1, 1, 1))
+        scene.add_geometry(box.apply_translation((offset, 0, 0)), node_name=name, geom_name=f"mesh of {name}")
+    scene.export(tmp_path / "a.glb")
+    mesh = read_mesh_file(tmp_path / "a.glb")
+    parts = mesh.split_parts()
+    assert parts.keys() == {"book.1", "book.2", "door"}
+    assert np.allclose([mesh.vertices[faces, 0].mean() for faces in map(parts.get, sorted(parts))], [0, 2, 4])
+    triangle = "v 0 0 {0}\nv 1 0 {0}\nv 0 1 {0}\n"
+    text = (
+        triangle.format(0)
+        + "f -3 -2 -1\n"
+        + "".join(
+            f"o {name}\n{triangle.format(z)}f -3 -2 -1\n" for z, name in enumerate(("red book", "door", "red book"), 1)
+        )
+    )
+    (tmp_path / "a.obj").write_text(text)
+    mesh = read_mesh_file(tmp_path / "a.obj")
+    heights = {name: mesh.vertices[faces, 2].mean(axis=1).tolist() for name, faces in mesh.split_parts().items()}
+    assert heights == {"mesh": [0], "red book": [1, 3], "door": [2]}
+    (tmp_path / "a.ply").write_bytes(trimesh.creation.box().export(file_type="ply"))
+    assert read_mesh_file(tmp_path / "a.ply").split_parts().keys() == {"mesh"}
+
+
 def test_glb_of_trimesh_is_read_with_nodes(tmp_path):
     scene = trimesh.Scene()
     ball = trimesh.creation.icosphere(1)
