@@ -249,7 +249,7 @@ from nerg_mi.transport.medium import Medium
 from nerg_mi.transport.observer import VISIBILITIES, ObserverCache, ObserverSettings, check_center, sensor_center
 from nerg_mi.transport.observer_gaze import GazeFieldInstance
 from nerg_mi.transport.quadrature import RULES, cells_for_rule
-from nerg_mi.transport.recording import Recorder
+from nerg_mi.transport.recording import FrozenChildren, Recorder
 from nerg_mi.transport.volume_medium import FrozenBound, VolumeMedium
 
 from .nerg_pixel import RenderContext
@@ -487,11 +487,15 @@ class NergIntegrator(mi.SamplingIntegrator):
                 f'"nerg" renders rgb and mono variants, not "{mi.variant()}": radiance fields are trained on rgb '
                 'photos; call mi.set_variant("llvm_ad_rgb")'
             )
-        self._children = read_children(props)
-        self.medium, self._frozen_bound = make_medium(self._children)
-        self.gaze = make_gaze(self._children, self.medium)
-        self.observer = self._children["observer"]
-        self.shading = Shading(self._children["integrator"], read_number(props, "headlight", HEADLIGHT, Range(0, 1)))
+        self.variant = mi.variant()
+        # Not tested on graphics cards.
+        self.recorder = Recorder(is_enabled=str(self.variant).startswith("llvm"))
+        children = read_children(props)
+        self._children = FrozenChildren(children, self.recorder)
+        self.medium, self._frozen_bound = make_medium(children)
+        self.gaze = make_gaze(children, self.medium)
+        self.observer = children["observer"]
+        self.shading = Shading(children["integrator"], read_number(props, "headlight", HEADLIGHT, Range(0, 1)))
         check_observer(self.observer)
 
         self.occlusion = read_boolean(props, "occlusion", True)
@@ -506,9 +510,6 @@ class NergIntegrator(mi.SamplingIntegrator):
         self.aovs = nerg_aovs.parse_aovs(read_string(props, "aovs", "depth,opacity"), self)
         self.required_data = nerg_aovs.collect_required_data(self.aovs)
         self.views = nerg_aovs.collect_observer_views(self.aovs, self)
-        self.variant = mi.variant()
-        # Not tested on graphics cards.
-        self.recorder = Recorder(is_enabled=str(self.variant).startswith("llvm"))
         self.cache = ObserverCache(recorder=self.recorder)
         self._sensors = None  # sensor of the current rendering; None if another integrator calls this one
 
@@ -575,7 +576,7 @@ class NergIntegrator(mi.SamplingIntegrator):
     @property
     def children(self):
         """The volumes, the observer and the nested integrator, by parameter name."""
-        children = self._children | {"integrator": self.shading.nested}
+        children = self._children.objects | {"integrator": self.shading.nested}
         return {name: child for name, child in children.items() if child is not None}
 
     def traverse(self, cb):

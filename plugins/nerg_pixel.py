@@ -17,16 +17,20 @@ from nerg_mi.maths.types import Bool, Color, Float, Point3f, Ray3f, Vector3f
 from nerg_mi.transport import aovs as nerg_aovs
 from nerg_mi.transport import observer
 from nerg_mi.transport.depth import DEPTHS
-from nerg_mi.transport.field_medium import FeatureShader, FieldMedium, make_color_shader
+from nerg_mi.transport.field_medium import FeatureShader, make_color_shader
 from nerg_mi.transport.geometry import SceneGeometry
 from nerg_mi.transport.jit import is_recording
 from nerg_mi.transport.march_primal import MarchResult
 from nerg_mi.transport.medium import SampleShader
 from nerg_mi.transport.observer import CacheEntry, ObserverCache, ObserverView, observe_view, select_nearest
-from nerg_mi.transport.observer_gaze import GazeFieldInstance, ObservedGaze, has_listed_networks
+from nerg_mi.transport.observer_gaze import (
+    GazeFieldInstance,
+    ObservedGaze,
+    list_geometry_inputs,
+    require_listed_networks,
+)
 from nerg_mi.transport.occlusion import ObserverHit, ObserverMap, get_observer_map, trace_from_observer
 from nerg_mi.transport.quadrature import RULES
-from nerg_mi.transport.recording import NotRecordable
 from nerg_mi.transport.splat_medium import SplatMedium
 
 # Mitsuba, with its arrays typed as in `maths.types`.
@@ -106,16 +110,12 @@ class RenderContext:
     def list_inputs(self, scene: mi.Scene) -> list[Any]:
         """All objects that camera rays of ``scene`` read, for a recording. Raises `NotRecordable`."""
         nerg = self.nerg
-        if len(scene.shapes()) > 0 or len(scene.emitters()) > 0:
-            raise NotRecordable("the shapes and lights of the scene")
-        if not (nerg.medium is None or isinstance(nerg.medium, FieldMedium)):
-            raise NotRecordable(f"a {type(nerg.medium).__name__}")
-        trained = [nerg.medium.field] if nerg.medium is not None else []
-        trained += [] if nerg.gaze is None else [nerg.gaze.field]
-        if not all(map(has_listed_networks, trained)):
-            raise NotRecordable("constant weights, or networks that a field does not list")
+        inputs = list_geometry_inputs(SceneGeometry(nerg.medium, scene))
+        if nerg.gaze is not None:
+            require_listed_networks(nerg.gaze.field)
+        inputs.append(scene if len(scene.emitters()) > 0 else None)
         rules = [RULES.find(nerg.settings.quadrature), DEPTHS.find(nerg.observer_settings.depth)]
-        return [self, nerg.hide_emitters, rules, [nerg_aovs.AOVS[name].compute for name in self.aovs]]
+        return [*inputs, self, nerg.hide_emitters, rules, [nerg_aovs.AOVS[name].compute for name in self.aovs]]
 
     def make_own_observer(self, sensors: Sequence[mi.Sensor]) -> ObserverContext:
         """The observer of the integrator, or the centre of the only one of ``sensors``, evaluated."""

@@ -20,8 +20,8 @@ def render_tensor(
 
     The first image of a structure is traced, as by ``mi.render``; the second one is recorded, and further ones are
     replayed, which takes a tenth of the time for small images. A structure is the size of the film, the samples per
-    pixel, the AOVs and the settings of the integrator. Cameras, observers, seeds, fall-off and weights may change
-    between images, by ``mi.traverse`` or otherwise.
+    pixel, the AOVs, the settings of the integrator, and the objects of the scene. Cameras, observers, seeds, fall-off,
+    weights, shapes, materials and lights may change between images, by ``mi.traverse`` or otherwise.
 
     Parameters
     ----------
@@ -48,8 +48,8 @@ def render_tensor(
     Warns
     -----
     UserWarning
-        Once for each scene that cannot be recorded, with the reason: shapes, lights, splats or volumes, constant
-        weights, derivatives, or a sensor or sampler of another kind. Its images are traced.
+        Once for each scene that cannot be recorded, with the reason: splats or volumes, constant weights, derivatives,
+        or a sensor or sampler of another kind. Its images are traced.
 
     Examples
     --------

@@ -337,6 +337,8 @@ class Shading:
         For integrators that do not compute radiance per ray.
     """
 
+    UNRECORDED = ("_path",)  # Depends on the scene, and has no arrays.
+
     def __init__(self, nested: mi.SamplingIntegrator | None = None, headlight: float = HEADLIGHT):
         import mitsuba as mi
 

@@ -27,7 +27,7 @@ from .geometry import SceneGeometry
 from .jit import Fingerprint, is_recording
 from .observer import CacheEntry, ObserverCache, ObserverSettings, fingerprint_geometry, select_nearest
 from .quadrature import RULES
-from .recording import Recorder
+from .recording import NotRecordable, Recorder
 
 # ---- Integral over an observer's sphere, with an error estimate ----
 #
@@ -230,11 +230,11 @@ class ObserverTracer:
             depth = dr.select(has_surface, ray_hit.depth(settings.depth, has_surface), end)
             return has_surface, cast("Float", depth)
 
-        if self.recorder is None or not is_field(self.geometry):
+        if self.recorder is None:
             return trace()
         rules = [RULES.find(self.settings.march.quadrature), DEPTHS.find(self.settings.depth)]
         frame = [self.placed.field.box, self.placed.to_world]
-        list_inputs = lambda: [self.geometry, self.center, self.settings, *rules, *frame]
+        list_inputs = lambda: [*list_geometry_inputs(self.geometry), self.center, self.settings, *rules, *frame]
         key = "surfaces", dr.width(directions), ends_at_box
         return self.recorder.run(trace, key, list_inputs, [directions])
 
@@ -426,9 +426,13 @@ class _SphereIntegral:
         return entry.value.get(count, tracer)
 
     def _integrand(self, entry: CacheEntry, samples: SphereSamples) -> Float:
-        if self.recorder is None or not has_listed_networks(self.member) or not is_field(self.geometry):
+        if self.recorder is None:
             return self._evaluate_integrand(entry, samples)
-        list_inputs = lambda: [self.placed, self.member]
+
+        def list_inputs() -> list[Any]:
+            require_listed_networks(self.member)
+            return [self.placed, self.member]
+
         key, arrays = ("integrand", dr.width(samples.directions)), [entry.center, samples.directions]
         arrays += [samples.distance, samples.escaped]
         return self.recorder.run(lambda: self._evaluate_integrand(entry, samples), key, list_inputs, arrays)
@@ -612,19 +616,26 @@ class ObservedGaze:
         return ObservedHits.merge([entry.value for entry in self._hits])
 
 
-def has_listed_networks(field: Any) -> bool:
-    """Whether a recording knows what ``field`` reads: it lists its networks, whose weights are no constants.
+def require_listed_networks(field: Any) -> None:
+    """Raise `NotRecordable` unless a recording knows what ``field`` reads: it lists its networks, whose weights are no
+    constants.
 
     Registered fields of other packages need not list theirs, and may read what is no attribute.
     """
     networks = getattr(field, "mlps", None)
-    return networks is not None and not any(net.has_constant_weights for net in networks)
+    if networks is None or any(net.has_constant_weights for net in networks):
+        raise NotRecordable("constant weights, or networks that a field does not list")
 
 
-def is_field(geometry: SceneGeometry) -> bool:
-    """Whether ``geometry`` is a radiance field alone that can be recorded."""
+def list_geometry_inputs(geometry: SceneGeometry) -> list[Any]:
+    """All that rays through ``geometry`` read, for a recording. Raises `NotRecordable`."""
     medium = geometry.medium
-    return geometry.scene is None and isinstance(medium, FieldMedium) and has_listed_networks(medium.field)
+    if isinstance(medium, FieldMedium):
+        require_listed_networks(medium.field)
+    elif medium is not None:
+        raise NotRecordable(f"a {type(medium).__name__}")
+    # Without a medium, tolerances depend on the size of the shapes.
+    return [geometry, geometry.shape_diagonal if medium is None and geometry.scene is not None else None]
 
 
 # ---- Gaze of one observer in arbitrary directions ----

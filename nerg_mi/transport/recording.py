@@ -9,11 +9,12 @@ traced again. An evaluated array that is not an input is an error of Dr.Jit, not
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from enum import Enum
 from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
-from typing import Any
+from typing import Any, ClassVar
 
 import drjit as dr
 import drjit.nn as nn
@@ -35,23 +36,28 @@ class State:
     """All that ``roots`` contain, in a fixed order.
 
     Attributes of Python objects are followed, except those that their class names in ``UNRECORDED``: attributes that no
-    traced program reads, or that it reads only with derivatives. Raises `NotRecordable` for an object of Mitsuba, whose
-    state Python cannot list.
+    traced program reads, or that it reads only with derivatives. Of objects of Mitsuba that are written in C++, Dr.Jit
+    lists the arrays.
 
     Attributes
     ----------
     arrays : list
         The Dr.Jit arrays.
+    natives : list
+        The objects of Mitsuba.
+    parameters : list
+        Those of their arrays that can carry derivatives.
     key : list
         Everything else, comparable with ``==``; objects without attributes by their identity.
     held : list
         The objects that are compared by identity, which must live as long as the key.
     """
 
-    __slots__ = ("_numbers", "arrays", "held", "key")
+    __slots__ = ("_numbers", "arrays", "held", "key", "natives", "parameters")
 
     def __init__(self, roots: Iterable[Any]):
         self.arrays, self.key, self.held = list[Any](), list[Hashable](), list[Any]()
+        self.natives, self.parameters = list[Any](), list[Any]()
         self._numbers: dict[int, int] = {}
         for root in roots:
             self.add(root)
@@ -100,7 +106,7 @@ def _find_visit(kind: type) -> Callable[[State, Any], None]:
     if kind.__dictoffset__:
         return _visit_object
     if any(base.__module__.partition(".")[0] == "mitsuba" for base in kind.__mro__):
-        return _refuse
+        return _visit_native
     return _visit_identity
 
 
@@ -165,15 +171,63 @@ def _visit_object(state: State, value: Any) -> None:
                 state.add(item)
 
 
-def _refuse(state: State, value: Any) -> None:
-    raise NotRecordable(f"an object of the type {type(value).__name__}")
+def _visit_native(state: State, value: Any) -> None:
+    import mitsuba as mi
+
+    state.natives.append(value)
+    if isinstance(value, mi.Scene):
+        # Emitters around the scene are as large as it is.
+        box = value.bbox()
+        state.key += (*map(float, box.min), *map(float, box.max))
+    _list_native(state, value)
 
 
 # ---- Objects of Mitsuba ----
 #
 # Dr.Jit lists the arrays of objects that are written in C++. Their other values belong to the key.
 
-_SENSORS = ("PerspectiveCamera", "ThinLensCamera", "OrthographicCamera", "Panorama")
+
+def _list_native(state: State, node: Any) -> None:
+    """Add the identities of a ``node`` and of its children, and parameters that are not arrays; of a scene neither
+    sensors nor the integrator."""
+    import mitsuba as mi
+
+    if type(node).__dictoffset__:
+        # A plugin that is written in Python.
+        state.add(node)
+    elif state.is_new(node):
+        _visit_identity(state, node)
+        node.traverse(_get_callback_class(mi.variant())(state, node))
+
+
+@functools.cache
+def _get_callback_class(variant: str) -> type:
+    # Mitsuba's classes depend on the variant.
+    import mitsuba as mi
+
+    class ParameterCallback(mi.TraversalCallback):
+        def __init__(self, state: State, node: Any):
+            super().__init__()
+            self.state, self.node = state, node
+
+        def put(self, name: str, value: Any, flags: Any, kind: Any = None) -> None:
+            if isinstance(value, mi.Object):
+                if not isinstance(value, (mi.Sensor, mi.Integrator)):
+                    _list_native(self.state, value)
+                return
+            value = value if kind is None else mi.get_property(value, kind, self.node)
+            # Of transforms, the matrix.
+            array = getattr(value, "matrix", value)
+            if dr.is_jit_v(type(array)):
+                self.state.parameters.append(array)
+            else:
+                self.state.key += (name, str(value))
+
+    return ParameterCallback
+
+
+# Mitsuba 3.9.1 does not list all arrays of other cameras, such as "thinlens" and "orthographic".
+_SENSORS = ("PerspectiveCamera", "Panorama")
 
 
 def _list_sensor(state: State, sensor: Any) -> None:
@@ -202,6 +256,9 @@ def _list_block(state: State, block: Any) -> None:
 
 # ---- Recordings ----
 
+_UNLISTED = "was not specified as an input variable"
+"""Part of Dr.Jit's message if a function reads an array that it does not list."""
+
 _MAX_VARIANTS = 4
 """Recordings of one key: Dr.Jit also distinguishes literals, and arrays of one element."""
 
@@ -211,6 +268,7 @@ class _Recording:
 
     def __init__(self, held: list[Any]):
         self.body: Callable[[], Any] | None = None
+        self.has_listed_arrays = True
         self._held = held
         # The object is no pytree, so that Dr.Jit compares its identity.
         current = self
@@ -233,7 +291,11 @@ class _Recording:
             return self._function(arrays, natives)
         except RuntimeError as error:
             # Dr.Jit replaces the error of the function.
-            raise (error.__cause__ or error) from None
+            cause = error.__cause__ or error
+            if _UNLISTED not in str(cause):
+                raise cause from None
+            self.has_listed_arrays = False
+            return body()
         finally:
             self.body = None
 
@@ -251,9 +313,10 @@ class Recorder:
 
     def __init__(self, is_enabled: bool = True, max_recordings: int = 16):
         self.is_enabled, self._max_recordings = is_enabled, max_recordings
-        self._recordings: dict[Hashable, _Recording | None] = {}
+        self._recordings: dict[Hashable, _Recording] = {}
         # Why the last function was not recorded; "" if it was. Reasons that were reported.
         self.reason, self._reported = "", set[str]()
+        self.is_replaying = False
 
     def run(
         self,
@@ -292,22 +355,28 @@ class Recorder:
             return body()
         arrays = [*numbers, *state.arrays]
         with dr.resume_grad():
-            has_gradients = dr.grad_enabled(arrays)
+            has_gradients = dr.grad_enabled(arrays, state.parameters)
         if is_recording() or has_gradients:
             self.reason = "derivatives or another recording"
             return body()
         full_key = key, dr.expand_threshold(), dr.thread_count(), tuple(state.key)
-        if full_key not in self._recordings:
-            self._store(full_key, None)
+        recording = self._recordings.pop(full_key, None)
+        self._store(full_key, recording or _Recording(state.held))
+        if recording is None:
             return body()
-        recording = self._recordings.pop(full_key) or _Recording(state.held)
-        self._store(full_key, recording)
+        if not recording.has_listed_arrays:
+            self.reason = "a plugin of Mitsuba whose arrays Dr.Jit cannot list"
+            return body()
         if recording.count >= _MAX_TRACED:
             self.reason = "arrays whose kind changes from image to image"
             return body()
-        return recording(body, arrays, [sensor, *blocks])
+        self.is_replaying = True
+        try:
+            return recording(body, arrays, [sensor, *blocks, *state.natives])
+        finally:
+            self.is_replaying = False
 
-    def _store(self, key: Hashable, recording: _Recording | None) -> None:
+    def _store(self, key: Hashable, recording: _Recording) -> None:
         self._recordings[key] = recording
         while len(self._recordings) > self._max_recordings:
             del self._recordings[next(iter(self._recordings))]
@@ -321,3 +390,21 @@ class Recorder:
     def clear(self) -> None:
         """Drop all recordings."""
         self._recordings.clear()
+
+
+class FrozenChildren:
+    """Exposes the ``objects`` of an integrator to ``dr.freeze``, except to the ``recorder``, which knows what it reads:
+    it takes Dr.Jit longer to list all their arrays than to replay a small image."""
+
+    DRJIT_STRUCT: ClassVar[dict[str, None]] = {"exposed": None}
+
+    def __init__(self, objects: dict[str, Any], recorder: Recorder):
+        self.objects, self._recorder = objects, recorder
+
+    @property
+    def exposed(self) -> dict[str, Any]:
+        return {} if self._recorder.is_replaying else self.objects
+
+    @exposed.setter
+    def exposed(self, value: dict[str, Any]) -> None:
+        """Dr.Jit assigns to the objects themselves."""
