@@ -57,6 +57,8 @@ class RenderContext:
     views: Mapping[str, ObserverView]
     # Whether colour is computed.
     radiance: bool
+    # The geometry as seen from the camera, and from there only, if a recording needs it before: at most one.
+    seen: list[SceneGeometry] = field(default_factory=list)
 
     @property
     def can_use_gaze_map(self) -> bool:
@@ -107,10 +109,12 @@ class RenderContext:
         offset = cast("Any", sampler).next_1d(active) if self.nerg.jitter else None
         return CameraView(self, scene, sensors, ray, active, offset, may_list)
 
-    def list_inputs(self, scene: mi.Scene) -> list[Any]:
-        """All objects that camera rays of ``scene`` read, for a recording. Raises `NotRecordable`."""
+    def list_inputs(self, scene: mi.Scene, sensors: Sequence[mi.Sensor], lanes: int) -> list[Any]:
+        """All objects that ``lanes`` rays of ``sensors`` read, for a recording. Raises `NotRecordable`."""
         nerg = self.nerg
-        inputs = list_geometry_inputs(SceneGeometry(nerg.medium, scene))
+        geometry = see_from_camera(SceneGeometry(nerg.medium, scene), sensors, count_rays(sensors, lanes))
+        self.seen[:] = [geometry]
+        inputs = list_geometry_inputs(geometry)
         if nerg.gaze is not None:
             require_listed_networks(nerg.gaze.field)
         inputs.append(scene if len(scene.emitters()) > 0 else None)
@@ -152,6 +156,8 @@ class ObserverContext:
     cache: ObserverCache
     # Whether the observer is at the camera; None if that is not known.
     is_at_camera: bool | None = None
+    # The geometry as seen by the observer, if a recording needs it before.
+    seen: SceneGeometry | None = None
     _gaze: ObservedGaze | None = None
     _map: ObserverMap | None = None
     _views: dict[str, list[CacheEntry]] = field(default_factory=dict)
@@ -186,8 +192,25 @@ class ObserverContext:
             self.gaze(context, geometry).prepare(lanes)
         if context.nerg.occlusion and not self.is_at_camera and context.needs_visibility:
             self.map(context, geometry)
+            self.seen = geometry.seen_from(self.p_o, count_rays(sensors, lanes))
         for name, view in context.views.items():
             self.view(name, view)
+
+
+def count_rays(sensors: Sequence[mi.Sensor], lanes: int) -> int:
+    """Rays of whole images of ``sensors``; without any, ``lanes``."""
+    return sum(int(dr.prod(s.film().crop_size())) for s in sensors) or lanes
+
+
+def see_from_camera(geometry: SceneGeometry, sensors: Sequence[mi.Sensor], num_rays: int) -> SceneGeometry:
+    """``geometry`` for ``num_rays`` rays of a single camera with a centre; for others unchanged."""
+    # Windows are computed for splats only.
+    if len(sensors) != 1 or not isinstance(geometry.medium, SplatMedium):
+        return geometry
+    windows = observer.camera_windows(sensors[0])
+    if windows is None:
+        return geometry
+    return geometry.seen_from(observer.sensor_center(sensors[0]), num_rays, windows)
 
 
 class CameraView:
@@ -222,9 +245,12 @@ class CameraView:
         medium = context.nerg.medium
         self.geometry = SceneGeometry(medium, scene)
         # Rays of the whole image, of which this may be a strip.
-        self.num_rays = sum(int(dr.prod(s.film().crop_size())) for s in sensors) or dr.width(ray.o)
-        can_list = may_list and isinstance(medium, SplatMedium) and not is_recording()
-        traced = self._list_splats() if can_list else self.geometry
+        self.num_rays = count_rays(sensors, dr.width(ray.o))
+        traced = self.geometry
+        if context.seen:
+            (traced,) = context.seen
+        elif may_list and not is_recording():
+            traced = see_from_camera(self.geometry, sensors, self.num_rays)
         self.has_color = context.radiance and medium is not None and medium.has_color
         shader, features = None, "features" in context.required_data
         if medium is not None and self.has_color:
@@ -238,13 +264,6 @@ class CameraView:
             self.ray, active, context.nerg.settings, offset=offset, count=self.counts_evaluations, color=shader
         )
         self.has_matter = active & (self.ray_hit.opacity > 0)
-
-    def _list_splats(self) -> SceneGeometry:
-        """The geometry for rays of a single camera with a centre."""
-        windows = observer.camera_windows(self.sensors[0]) if len(self.sensors) == 1 else None
-        if windows is None:
-            return self.geometry
-        return self.geometry.seen_from(observer.sensor_center(self.sensors[0]), self.num_rays, windows)
 
     def make_pixel(self, observer: ObserverContext | None = None, is_aligned: bool = False) -> Pixel:
         """These rays for an observer; None: that of the context. ``is_aligned``: whether the observer is known to be at
@@ -404,7 +423,7 @@ class Pixel:
         if not context.nerg.occlusion or self.is_aligned:
             return ObserverHit(camera.p_d, self.distance_and_direction[0], arrays.Float(1), arrays.Float(0))
         sight = trace_from_observer(
-            camera.geometry,
+            self.observer.seen or camera.geometry,
             camera.ray,
             camera.p_d,
             self.observer.p_o,

@@ -739,7 +739,7 @@ class AovLayer:
         if self._context.observer_aovs:
             self._observer = self._observer or self._context.make_own_observer([self._sensor])
             self._observer.prepare(self._context, scene, [self._sensor], num_rays)
-        return [*self._context.list_inputs(scene), self._observer]
+        return [*self._context.list_inputs(scene, [self._sensor], num_rays), self._observer]
 
     def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any, active: Any) -> Iterable[tuple]:
         camera = self._context.trace(scene, [self._sensor], sampler, ray, active)

@@ -92,7 +92,7 @@ class SceneObserver:
             raise ValueError("a scene without a gaze field has no gaze")
         return self.gaze.evaluate(p_od, p_o, r_o, active)[0]
 
-    def observe(self, points: Any, with_gaze: bool) -> dict[str, Any]:
+    def observe(self, points: Any, with_gaze: bool, seen: SceneGeometry | None = None) -> dict[str, Any]:
         """Compute what the observer sees of points.
 
         Parameters
@@ -101,6 +101,8 @@ class SceneObserver:
             Points in scene units.
         with_gaze : bool
             Whether to compute the gaze.
+        seen : SceneGeometry, optional
+            The geometry as seen from the observer (`SceneGeometry.seen_from`).
 
         Returns
         -------
@@ -117,8 +119,9 @@ class SceneObserver:
         distance, r_o = distance_and_direction(self.center, points)
         active = dr.full(mi.Bool, True, dr.width(points))
         ray = mi.Ray3f(self.center, r_o)
+        geometry = seen or self.geometry
         hit = trace_from_observer(
-            self.geometry, ray, points, self.center, 0, active, i.falloff, i.observer_settings, observer_map=self.map
+            geometry, ray, points, self.center, 0, active, i.falloff, i.observer_settings, observer_map=self.map
         )
         values = {"distance": distance, "depth": hit.depth, "visibility": hit.visibility}
         if with_gaze:
@@ -297,7 +300,7 @@ class _Tracer:
         def list_inputs() -> list[Any]:
             for observer in observers:
                 observer.prepare(context, scene, [], len(o))
-            return [*context.list_inputs(scene), observers]
+            return [*context.list_inputs(scene, [], len(o)), observers]
 
         def trace() -> tuple[list[Any], list[Any], list[list[Any]]]:
             with dr.suspend_grad():
@@ -428,22 +431,26 @@ def _observe_points(observer: SceneObserver, p: Floats, with_gaze: bool) -> dict
     import drjit as dr
     import mitsuba as mi
 
+    from nerg_mi.transport.observer_gaze import list_geometry_inputs
+
     context, scene = observer.integrator.context(), observer.scene.mitsuba
     recorder, parts = observer.integrator.recorder, dict[str, list[Floats]]()
 
     def list_inputs() -> list[Any]:
         if observer.gaze is not None:
             observer.gaze.prepare(len(part))
-        return [*context.list_inputs(scene), observer.center, observer.gaze, observer.map]
+        inputs = [*context.list_inputs(scene, [], len(part)), *list_geometry_inputs(seen)]
+        return [*inputs, observer.center, observer.gaze, observer.map]
 
     def observe() -> dict[str, Any]:
         with dr.suspend_grad():
-            values = observer.observe(points, with_gaze)
+            values = observer.observe(points, with_gaze, seen)
             dr.eval(values)
         return values
 
     for a in range(0, len(p), BATCH_SIZE):
         part = p[a : a + BATCH_SIZE]
+        seen = observer.geometry.seen_from(observer.center, len(part))
         points = to_vector(mi.Point3f, part)
         values = recorder.run(observe, ("observe", len(part), with_gaze), list_inputs, [points])
         for name, value in values.items():

@@ -48,8 +48,8 @@ def render_tensor(
     Warns
     -----
     UserWarning
-        Once for each scene that cannot be recorded, with the reason: splats or volumes, constant weights, derivatives,
-        or a sensor or sampler of another kind. Its images are traced.
+        Once for each scene that cannot be recorded, with the reason: constant weights, derivatives, a sensor or sampler
+        of another kind, or a plugin that Dr.Jit cannot record. Its images are traced.
 
     Examples
     --------

@@ -49,6 +49,8 @@ class OccupancyGrid(_Bits):
     which a cell counts as empty, also stored in checkpoints. Raises ``ValueError`` unless ``bits`` has three axes.
     """
 
+    UNRECORDED = ("bits",)
+
     def __init__(self, bits: np.ndarray, ns: ModuleType, threshold: float):
         bits = np.asarray(bits, bool)
         if bits.ndim != 3 or 0 in bits.shape:

@@ -213,7 +213,7 @@ class _ObserverLayers:
     def list_inputs(self, scene: Any, num_rays: int) -> list[Any]:
         for observer in self.observer_contexts:
             observer.prepare(self.context, scene, [self.sensor], num_rays)
-        return [*self.context.list_inputs(scene), self.observer_contexts]
+        return [*self.context.list_inputs(scene, [self.sensor], num_rays), self.observer_contexts]
 
     def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any, active: Any) -> Iterator[tuple]:
         camera = self.context.trace(scene, [self.sensor], sampler, ray, active)

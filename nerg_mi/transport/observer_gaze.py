@@ -28,6 +28,8 @@ from .jit import Fingerprint, is_recording
 from .observer import CacheEntry, ObserverCache, ObserverSettings, fingerprint_geometry, select_nearest
 from .quadrature import RULES
 from .recording import NotRecordable, Recorder
+from .splat_medium import SplatMedium
+from .volume_medium import VolumeMedium
 
 # ---- Integral over an observer's sphere, with an error estimate ----
 #
@@ -220,10 +222,11 @@ class ObserverTracer:
         """Whether there is a surface along unit ``directions``, and its distance in scene units; without one
         `miss_distance` if ``ends_at_box``, else 0."""
 
+        seen = self.geometry.seen_from(self.center, dr.width(directions))
+
         def trace() -> tuple[Bool, Float]:
             mi, settings = variant_types(), self.settings
             all_lanes = dr.full(mi.Bool, True, dr.width(directions))
-            seen = self.geometry.seen_from(self.center, dr.width(directions))
             ray_hit = seen.trace(mi.Ray3f(self.center, directions), all_lanes, settings.march)
             has_surface = all_lanes & ray_hit.has_surface(settings.surface_opacity)
             end = self.miss_distance(directions) if ends_at_box else 0
@@ -234,7 +237,7 @@ class ObserverTracer:
             return trace()
         rules = [RULES.find(self.settings.march.quadrature), DEPTHS.find(self.settings.depth)]
         frame = [self.placed.field.box, self.placed.to_world]
-        list_inputs = lambda: [*list_geometry_inputs(self.geometry), self.center, self.settings, *rules, *frame]
+        list_inputs = lambda: [*list_geometry_inputs(seen), self.center, self.settings, *rules, *frame]
         key = "surfaces", dr.width(directions), ends_at_box
         return self.recorder.run(trace, key, list_inputs, [directions])
 
@@ -632,7 +635,7 @@ def list_geometry_inputs(geometry: SceneGeometry) -> list[Any]:
     medium = geometry.medium
     if isinstance(medium, FieldMedium):
         require_listed_networks(medium.field)
-    elif medium is not None:
+    elif not (medium is None or isinstance(medium, (SplatMedium, VolumeMedium))):
         raise NotRecordable(f"a {type(medium).__name__}")
     # Without a medium, tolerances depend on the size of the shapes.
     return [geometry, geometry.shape_diagonal if medium is None and geometry.scene is not None else None]

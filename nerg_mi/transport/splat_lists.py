@@ -65,9 +65,11 @@ class SplatLists(SplatHits):
     ``center`` (3,) in the frame of the Gaussians ``arrays``. Derivatives are those of the tree.
     """
 
+    UNRECORDED = ("size",)
+
     def __init__(self, arrays: SplatArrays, center: np.ndarray, windows: tuple[Window, ...]):
         super().__init__(arrays)
-        self.windows = windows
+        self._num_windows, self._cells = len(windows), windows[0].cells
         ns = arrays.namespace
         self._ns = ns
         self.center = ns.Array3f(*(float(c) for c in center))
@@ -147,8 +149,8 @@ class SplatLists(SplatHits):
 
     def _find_list(self, d: Vector3f) -> tuple[UInt32, UInt32]:
         """First and last entry (exclusive) of the cell with the direction ``d``."""
-        ns, (nu, nv) = self._ns, self.windows[0].cells
-        if len(self.windows) == 1:
+        ns, (nu, nv) = self._ns, self._cells
+        if self._num_windows == 1:
             x, y, z = (dr.dot(axis, d) for axis in self._axes)
             face = ns.UInt32(0)
         else:

@@ -336,6 +336,8 @@ class SplatMedium:
     ``linear``. ``may_list``: whether rays from one point may read lists (`splat_lists.list_splats`).
     """
 
+    UNRECORDED = ("lists",)
+
     has_color = True
     is_deferred = False
     feature_count = 0

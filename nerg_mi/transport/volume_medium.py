@@ -29,6 +29,8 @@ class VolumeMedium:
     density without a finite extent, and for a grid with non-finite values.
     """
 
+    UNRECORDED = ("_read",)
+
     color_space = "spectrum"
     feature_count = 0
     is_density_separate = False

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import re
 import sys
 from dataclasses import replace
 
@@ -16,10 +17,12 @@ from nerg_mi.errors import NergError
 from nerg_mi.fields.gaze_base import RaySupport
 from nerg_mi.fields.gaze_hits import HitKernel, ReaimedHits
 from nerg_mi.formats.fields import save_gaze
+from nerg_mi.formats.splats import write_ply_splats
 from nerg_mi.registration import get_plugin_class
-from nerg_mi.transport import recording
+from nerg_mi.transport import recording, splat_lists
 from nerg_mi.transport.geometry import Ceiling
 from nerg_mi.transport.recording import Recorder
+from tests.formats.splats.writers import random_splats
 from tests.plugins import fields
 from tests.plugins.scenes import camera, make_observer, put, scene_with, stored, with_field
 
@@ -442,6 +445,74 @@ def test13_sequences_of_changes_of_shapes_and_lights_are_noticed(rgb, files, med
         render_both(rgb, scene, int(rng.integers(100)))
     # Mitsuba traces each image.
     assert 40 < count_traces() - before < 50
+
+
+# ---- Splats and volumes ----
+
+
+def make_medium_scene(mi, files, kind, visibility="depth"):
+    """Splats, as lists or as a tree, a grid of densities, or a radiance field as a density."""
+    data, grid = np.random.default_rng(2).uniform(0, 4, (5, 6, 7)).astype(np.float32), {"type": "gridvolume"}
+    box = mi.ScalarTransform4f().translate([-0.5, -0.5, -0.5])
+    medium = {
+        "lists": {"field": stored("splats", files / "splats.ply")},
+        "tree": {"field": stored("splats", files / "splats.ply", lists=False)},
+        "grid": {
+            "density": {**grid, "grid": mi.VolumeGrid(data), "to_world": box},
+            "color": {**grid, "grid": mi.VolumeGrid(np.stack([data / 4] * 3, -1)), "to_world": box},
+        },
+        "field": {"density": stored("nerf", files / "field.safetensors")},
+    }[kind]
+    integrator = {
+        "type": "nerg",
+        "gaze": stored("gazefield", files / "gaze.safetensors"),
+        "aovs": "depth,opacity,gaze,visibility,position",
+        "observer": make_observer(mi, -2, 0.3, -2),
+        "falloff": 0.5,
+        "visibility": visibility,
+        "directions": 512,
+        "map_height": 16,
+        **medium,
+    }
+    return scene_with(mi, integrator, camera(mi, size=9))
+
+
+def change_medium(mi, scene, rng):
+    params = mi.traverse(scene)
+    names = [key for key in params.keys() if re.match(r"integrator\.(field\.opac|density\.)", key)]
+    name = names[rng.integers(len(names))]
+    put(params, name, params[name] * float(rng.uniform(0.7, 0.99)))
+
+
+@pytest.mark.parametrize("visibility", ["depth", "map"])
+@pytest.mark.parametrize("kind", ["lists", "tree", "grid", "field"])
+def test15_sequences_of_changes_of_media_are_noticed(rgb, files, kind, visibility, count_traces, monkeypatch):
+    monkeypatch.setattr(splat_lists, "MIN_GAUSSIANS", 1)
+    write_ply_splats(files / "splats.ply", random_splats(60, degree=1))
+    scene, rng = make_medium_scene(rgb, files, kind, visibility), np.random.default_rng(4)
+    changes, before = [move_camera, move_observer, change_falloff, change_medium], count_traces()
+    for _ in range(30):
+        changes[rng.integers(len(changes))](rgb, scene, rng)
+        render_both(rgb, scene, int(rng.integers(100)))
+    # Mitsuba traces each image.
+    assert 30 < count_traces() - before < 45
+
+
+@pytest.mark.parametrize("kind", ["lists", "grid"])
+def test16_observers_of_media(rgb, files, kind, monkeypatch):
+    monkeypatch.setattr(splat_lists, "MIN_GAUSSIANS", 1)
+    write_ply_splats(files / "splats.ply", random_splats(60, degree=1))
+    scene, rng = nerg.Scene(make_medium_scene(rgb, files, kind)), np.random.default_rng(6)
+    for number in range(4):
+        points = rng.uniform(-0.4, 0.4, (20, 3))
+        observers = rng.uniform(-0.5, 0.5, (2, 3)) + (0, 0, -2.5)
+        ask = functools.partial(nerg.observe, scene, points, observers)
+        replayed = ask()
+        scene.integrator.recorder.clear()
+        scene.integrator.cache.clear()
+        expected = ask()
+        assert all(np.array_equal(replayed[name], expected[name]) for name in expected.names), number
+        ask()
 
 
 # ---- What cannot be recorded ----
