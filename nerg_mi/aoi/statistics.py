@@ -509,6 +509,8 @@ class _Analysis:
                 f"{len(too_small):,} areas or pairs, such as {too_small[0]['aoi']}, are smaller than twice the "
                 "accuracy of the tracker; they are in the table resolution"
             )
+        elif disturbance.mean_accuracy > 0:
+            self.reporter.message("no area is smaller than twice the accuracy of the tracker")
         return {"tracker": corrected, "resolution": too_small}
 
     def _list_participants(self, sums: VisitSums, show_names: bool, salt: FilePath | None) -> Sequence[Row]:

@@ -313,10 +313,11 @@ def _open_mesh_file(path: Path, keep_shapes: bool) -> Environment:
 
     mesh = read_mesh_file(path)
     parts = mesh.split_parts() if keep_shapes else {}
-    shapes = {"mesh": make_mesh(mesh.vertices, mesh.faces, "mesh")}
     if len(parts) > 1:
         used = {name: np.unique(faces, return_inverse=True) for name, faces in parts.items()}
         shapes = {name: make_mesh(mesh.vertices[v], k.reshape(-1, 3), name) for name, (v, k) in used.items()}
+    else:
+        shapes = {"mesh": make_mesh(mesh.vertices, mesh.faces, "mesh")}
     with translate_mitsuba_errors(path):
         # Names with dots are no keys of a dict of Mitsuba.
         scene = mi.load_dict({"type": "scene"} | {f"shape_{k}": shape for k, shape in enumerate(shapes.values())})
