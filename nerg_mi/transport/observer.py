@@ -72,7 +72,8 @@ class ObserverCache:
         self.recorder = scalar_cache.recorder if recorder is None and scalar_cache is not None else recorder
         self._slots: dict[Hashable, _CacheSlot] = {}
         self._values: dict[Hashable, tuple[Any, Any]] = {}
-        self._numbers = scalar_cache or self
+        # None, and not this cache: a cycle would keep its arrays until the next garbage collection.
+        self._scalar_cache = scalar_cache
 
     def get_or_compute_each(
         self, key: Hashable, observers: list[Point3f], dependencies: Any, compute: Callable[[Point3f], Any]
@@ -100,7 +101,8 @@ class ObserverCache:
         self, key: Hashable, entries: list[CacheEntry], dependencies: Any, compute: Callable[[CacheEntry], Any]
     ) -> list[CacheEntry]:
         """`get_or_compute` of a few scalars per observer; the entries of 256 earlier observers are kept, too."""
-        return self._numbers.get_or_compute(key, entries, dependencies, compute, _MAX_SCALARS)
+        cache = self if self._scalar_cache is None else self._scalar_cache
+        return cache.get_or_compute(key, entries, dependencies, compute, _MAX_SCALARS)
 
     def get_or_compute(
         self,

@@ -196,7 +196,9 @@ def _list_native(state: State, node: Any) -> None:
         # A plugin that is written in Python.
         state.add(node)
     elif state.is_new(node):
-        _visit_identity(state, node)
+        # A scene is told by its children. It holds its integrator, and would never be freed if that held the scene.
+        if not isinstance(node, mi.Scene):
+            _visit_identity(state, node)
         node.traverse(_get_callback_class(mi.variant())(state, node))
 
 
@@ -263,20 +265,26 @@ _MAX_VARIANTS = 4
 """Recordings of one key: Dr.Jit also distinguishes literals, and arrays of one element."""
 
 
+class _Body:
+    """The function that is recorded, while it is. No pytree, so that Dr.Jit compares its identity."""
+
+    __slots__ = ("function",)
+
+    function: Callable[[], Any]
+
+
 class _Recording:
     """The recording of functions of one key."""
 
     def __init__(self, held: list[Any]):
-        self.body: Callable[[], Any] | None = None
         self.has_listed_arrays = True
         self._held = held
-        # The object is no pytree, so that Dr.Jit compares its identity.
-        current = self
+        # Not this object: a cycle would keep its arrays until the next garbage collection.
+        current = self._body = _Body()
 
         def run(arrays: list[Any], natives: Sequence[Any]) -> Any:
-            assert current.body is not None
             with gc_paused():
-                return current.body()
+                return current.function()
 
         self._function: Any = dr.freeze(run, limit=_MAX_VARIANTS, warn_after=1 << 30)
 
@@ -286,7 +294,7 @@ class _Recording:
         return self._function.n_recordings
 
     def __call__(self, body: Callable[[], Any], arrays: list[Any], natives: Sequence[Any]) -> Any:
-        self.body = body
+        self._body.function = body
         try:
             return self._function(arrays, natives)
         except RuntimeError as error:
@@ -297,7 +305,7 @@ class _Recording:
             self.has_listed_arrays = False
             return body()
         finally:
-            self.body = None
+            del self._body.function
 
 
 _MAX_TRACED = 6

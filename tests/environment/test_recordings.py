@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import functools
+import gc
 import re
 import sys
+import weakref
 from dataclasses import replace
 
 import drjit as dr
@@ -445,6 +447,24 @@ def test13_sequences_of_changes_of_shapes_and_lights_are_noticed(rgb, files, med
         render_both(rgb, scene, int(rng.integers(100)))
     # Mitsuba traces each image.
     assert 40 < count_traces() - before < 50
+
+
+@pytest.mark.parametrize("is_lit", [False, True])
+def test17_scenes_are_freed_with_their_recordings(rgb, files, is_lit):
+    """Without a garbage collection: large fields have few objects, so that none may happen for long."""
+    integrator = with_field(files, aovs="depth")
+    shapes = {"ball": {"type": "sphere"}, "lamp": {"type": "point"}} if is_lit else {}
+    scene = scene_with(rgb, integrator, camera(rgb, size=6), **shapes)
+    for seed in range(3):
+        image(scene, scene.sensors()[0], 1, seed)
+    held = [weakref.ref(value) for value in (scene.integrator(), scene.integrator().recorder)]
+    gc.collect()
+    gc.disable()
+    try:
+        del scene
+        assert [value() for value in held] == [None, None]
+    finally:
+        gc.enable()
 
 
 # ---- Splats and volumes ----
