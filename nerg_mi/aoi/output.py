@@ -276,6 +276,24 @@ class StatisticsResult(ResultTables):
     num_suppressed: int = 0
     provenance: Provenance = field(default_factory=lambda: Provenance("nerg stats"))
 
+    @property
+    def verdict(self) -> str:
+        """The area with the largest share, and the significant differences between cells, in short sentences, one a
+        line."""
+        lines = []
+        shares = [row for row in self.aois if row["cell"] == "all" and row["share"] is not None]
+        for source in dict.fromkeys(row["source"] for row in shares):
+            largest = max((row for row in shares if row["source"] == source), key=lambda row: row["share"])
+            share = format_measure(largest, MEASURES_BY_NAME["share"])
+            lines.append(f"{largest['aoi']} has the largest {source} share of time: {share}.")
+        if self.differences:
+            significant = [row for row in self.differences if row["significant"]]
+            lines.append(f"{len(significant)} of {len(self.differences)} differences are significant.")
+            format_row = difference_columns(significant)[1]
+            for cell, first, second, aoi, measure, difference, *_ in map(format_row, significant):
+                lines.append(f"{aoi}, {measure}: {difference} from {cell} {first} to {second}.")
+        return "\n".join(lines)
+
     def save(self, folder: FilePath) -> list[Path]:
         """Write the non-empty tables (CSV, Markdown and, with pyarrow, Parquet), their figures and the provenance to a
         folder, which is created. Return the files."""

@@ -43,7 +43,7 @@ from .baselines import (
 )
 from .baselines import PRIOR as PRIOR_BASELINE
 from .gaze import EPS, SCORES, SPLIT_HALF, FieldDensity
-from .gaze_report import draw_comparison, explain_missing, write_report
+from .gaze_report import compute_verdict, draw_comparison, explain_missing, write_report
 from .position_scores import AWAY, RECORDED, format_verdicts, iter_region_levels, score_kinds
 from .uncertainty import correlate_uncertainty, measure_calibration, measure_coverage, score_positions
 
@@ -91,6 +91,13 @@ class GazeEvaluation(ResultTables):
     draw: Callable[[Path], None] | None = field(default=None, compare=False)
     # Bits of the field and of baselines where training participants stood, and where none did (`score_kinds`).
     verdicts: list[dict[str, Any]] = field(default_factory=list)
+
+    @property
+    def verdict(self) -> str:
+        """Whether the field is useful, and its lead over the best baseline where people stood and elsewhere, in short
+        sentences, one a line."""
+        verdict = compute_verdict(self.rows, self.split, self.people, self.positions)
+        return "\n".join([verdict.sentence, *format_verdicts(self.verdicts)])
 
     def save(self, folder: FilePath) -> list[Path]:
         """Write tables and figures to ``folder``, and return their paths.

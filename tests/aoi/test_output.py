@@ -148,6 +148,18 @@ def test_differences_have_units():
     assert cells(blank)[4:] == ["dwell time", "+1.50 s", "", "", ""]
 
 
+def test_the_verdict_names_the_largest_share_and_what_differs():
+    rows = [ROW_OF_AOI, ROW_OF_AOI | {"aoi": "b", "share": 0.3, "share_low": 0.25, "share_high": 0.36}]
+    rows.append(ROW_OF_AOI | {"aoi": "c", "share": 0.9, "cell": "zone", "value": "front"})
+    difference = {"cell": "zone", "first": "front", "second": "back", "aoi": "a", "measure": "share"}
+    difference |= {"difference": -0.06, "low": -0.08, "high": -0.04, "p": 0.001, "p_adjusted": 0.001}
+    differences = [difference | {"significant": True}, difference | {"aoi": "b", "significant": False}]
+    largest, count, one = StatisticsResult(aois=rows, differences=differences).verdict.splitlines()
+    assert largest.startswith("b ") and "30.0 % [25.0, 36.0]" in largest
+    assert count.startswith("1 of 2 ") and one.startswith("a, share of time: -6.00 points") and "front" in one
+    assert StatisticsResult().verdict == ""
+
+
 def test_many_participants_are_written_in_batches(tmp_path, monkeypatch):
     sums = VisitSums.empty(("x", "y"), (ALL,), [(ALL, f"p{k}") for k in range(5)])
     # The first batch has no visits.

@@ -77,6 +77,8 @@ def test_scores_are_listed_with_the_baselines(trained, tmp_path):
     assert {row["kind"] for row in result.verdicts} == {"new positions"}
     assert {row["method"] for row in result.verdicts} >= {"gaze field", "stack", "re-aimed hits"}
     assert [row["bits"] for row in result.verdicts if row["method"] == PRIOR] == [0]
+    first, *lead = result.verdict.splitlines()
+    assert "verdict" in first and len(lead) == 1 and "new positions" in lead[0]
     # Calibrated on the data that the folds of the training held out.
     assert result.calibration[1]["method"] == "gaze field, calibrated"
     # At the test positions, and at the origins of all held-out rays.
