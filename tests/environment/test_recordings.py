@@ -113,7 +113,7 @@ def move_observer_to_camera(mi, scene, rng):
 
 
 def change_falloff(mi, scene, rng):
-    put(mi.traverse(scene), "integrator.falloff", float(rng.uniform(1, 4)))
+    put(mi.traverse(scene), "integrator.falloff", float(rng.uniform(2, 4)))
 
 
 def change_weights(mi, scene, rng):
