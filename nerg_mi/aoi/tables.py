@@ -357,7 +357,7 @@ def aoi_rows(
                     elif row[name] is None:
                         reason = f"no {MEASURES_BY_NAME[name].population}"
                     else:
-                        reason = _NO_INTERVAL if row[name + "_low"] is None or row[name + "_high"] is None else ""
+                        reason = NO_INTERVAL if row[name + "_low"] is None or row[name + "_high"] is None else ""
                     reasons.setdefault(reason, []).append(name)
                 row["note"] = join_reasons(reasons)
                 rows_of_source[source].append(row)
@@ -366,7 +366,7 @@ def aoi_rows(
 
 
 _NOT_COMPUTED, _NOT_PREDICTED = "visibility is not computed", "a gaze field has no time course"
-_NO_INTERVAL = f"no interval, fewer than {MIN_PARTICIPANTS} participants with values other than 0, or equal values"
+NO_INTERVAL = f"no interval, fewer than {MIN_PARTICIPANTS} participants with values other than 0, or equal values"
 
 
 def explain_difference(row: Row, has_both: bool, min_participants: MinParticipantsFilter, is_allowed: bool) -> str:
@@ -377,7 +377,7 @@ def explain_difference(row: Row, has_both: bool, min_participants: MinParticipan
         return "undefined, equal values" if has_both else "no participants on one side"
     reasons: dict[str, list[str]] = {"": []}
     if row["low"] is None:
-        reasons[_NO_INTERVAL] = ["low, high"]
+        reasons[NO_INTERVAL] = ["low, high"]
     elif row["p"] is None:
         reasons["undefined, since no participant differs from the others"] = ["p"]
     return join_reasons(reasons)

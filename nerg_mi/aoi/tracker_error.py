@@ -19,7 +19,7 @@ from nerg_mi.tracking.readers.columns import open_named_table
 from .estimates import estimate_ratios
 from .placed import PlacedAreas
 from .settings import TrackerError, VisitRules
-from .tables import MEASURES_BY_NAME, Measure, MinParticipantsFilter, Participants, Row
+from .tables import MEASURES_BY_NAME, NO_INTERVAL, Measure, MinParticipantsFilter, Participants, Row
 from .visits import VisitSums, make_timeline
 
 # ---- Disturbed samples ----
@@ -197,7 +197,7 @@ def _explain_row(row: Row, is_allowed: bool, min_participants: MinParticipantsFi
         return f"no {MEASURES_BY_NAME[row['measure']].population}"
     if row["corrected"] is None:
         return "undefined with added error"
-    return "" if row["low"] is not None and row["high"] is not None else "no interval, too few participants or values"
+    return "" if row["low"] is not None and row["high"] is not None else NO_INTERVAL
 
 
 # ---- Areas that are too small ----
