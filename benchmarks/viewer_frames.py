@@ -62,10 +62,10 @@ def measure(scene: Path, width: int, seconds: float, compile: bool) -> list[list
     from nerg_mi.viewer.page import REST_SECONDS, BrowserWindow, Page
     from nerg_mi.viewer.points import PinholeView
     from nerg_mi.viewer.session import Session, SessionSettings
-    from nerg_mi.viewer.source import open_viewer_scene
+    from nerg_mi.viewer.source import open_viewer_inputs
 
     settings = SessionSettings(width=width, compile=compile)
-    session = Session(lambda: open_viewer_scene(scene), settings, Listener())
+    session = Session(lambda: open_viewer_inputs(scene), settings, Listener())
     session.start()
     try:
         while compile and session.compiled is None:

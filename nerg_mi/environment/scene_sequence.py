@@ -9,7 +9,7 @@ from typing import Any
 from nerg_mi.errors import NergError
 
 from .bands import is_nerg
-from .scene_loading import check_scene, check_scene_file, load_scene
+from .scene_loading import check_scene, check_scene_file, list_scene_files, load_scene
 
 _MOVABLE = frozenset(
     "to_world fov fov_axis focal_length near_clip far_clip principal_point_offset_x principal_point_offset_y "
@@ -26,19 +26,34 @@ class SceneSequence:
 
     Where only sensors move, or the observer of `nerg`, the loaded scene takes their properties: fields and shapes are
     not read again, and images of the scene are replayed. A scene is valid until the next one is loaded.
+
+    Parameters
+    ----------
+    path
+        Scene file, or a name of ``loaded`` for messages.
+    values
+        Values of all scenes.
+    loaded
+        A Mitsuba scene in memory, which is the only scene. None: the file is loaded.
     """
 
-    def __init__(self, path: Path):
-        self._path = path
-        self._scene: Any = None
+    def __init__(self, path: Path, values: Mapping[str, str] | None = None, loaded: Any = None):
+        self.path, self.values = path, dict(values or {})
+        self.has_file = loaded is None
+        self._scene: Any = loaded
         self._nodes: Any = None
 
-    def load(self, values: Mapping[str, str]) -> Any:
-        """Return the Mitsuba scene with these values; errors as for `load_scene`."""
-        if self._scene is None or not self._move_sensors(values):
+    def list_files(self, frame: Mapping[str, str]) -> list[Path]:
+        """Return the scene file and the files that it names with ``frame``; none for a scene in memory."""
+        return list_scene_files(self.path, {**self.values, **frame}) if self.has_file else []
+
+    def load(self, frame: Mapping[str, str]) -> Any:
+        """Return the Mitsuba scene with the values of ``frame``, too; errors as for `load_scene`."""
+        values = {**self.values, **frame}
+        if self.has_file and (self._scene is None or not self._move_sensors(values)):
             # Before the next scene is read, the memory of the last one is free.
             self._scene = self._nodes = None
-            self._scene = load_scene(self._path, values)
+            self._scene = load_scene(self.path, values)
             self._nodes = self._parse(values).nodes
         return self._scene
 
@@ -46,7 +61,7 @@ class SceneSequence:
         """Give the loaded scene its sensors with ``values``; return False if other objects change, too."""
         import mitsuba as mi
 
-        check_scene_file(self._path, values)
+        check_scene_file(self.path, values)
         integrator, sensors = self._scene.integrator(), list(self._scene.sensors())
         has_observer = is_nerg(integrator) and integrator.observer is not None
         sensors += [integrator.observer] if has_observer else []
@@ -83,7 +98,7 @@ class SceneSequence:
         for index in indices:
             root[f"sensor{index}"] = mi.Properties.ResolvedReference(index)
         scene = parser.instantiate(parser.ParserConfig(mi.variant()), state)
-        check_scene(self._path, scene)
+        check_scene(self.path, scene)
         return scene.sensors()
 
     def _parse(self, values: Mapping[str, str]) -> Any:
@@ -93,7 +108,7 @@ class SceneSequence:
         parser: Any = mi.parser
         config = parser.ParserConfig(mi.variant())
         config.merge_meshes = config.merge_equivalent = False
-        state = parser.parse_file(config, str(self._path), **values)
+        state = parser.parse_file(config, str(self.path), **values)
         parser.transform_all(config, state)
         return state
 

@@ -15,6 +15,7 @@ from nerg_mi.environment.planned import PlannedFiles
 from nerg_mi.environment.rendering_files import IMAGE_FORMATS, frame_path, read_frames
 from nerg_mi.environment.scene import Scene
 from nerg_mi.environment.scene_loading import activate_variant
+from nerg_mi.environment.scene_sequence import SceneSequence
 from nerg_mi.errors import NergError, parameter
 from nerg_mi.files.atomic import check_writable
 from nerg_mi.files.html import Summary
@@ -29,7 +30,6 @@ from nerg_mi.tasks.task import Part, Plan
 from .frames import (
     DrawnPicture,
     FilmProvenance,
-    FilmScene,
     Frame,
     FrameRenderer,
     FrameSettings,
@@ -187,7 +187,7 @@ def render_film(
     look = {"vmax": vmax, "smoothing": smoothing, **appearance}
     _check_output(output, overlay, look, frames is not None, fps)
     source, listed = _open_scene(scene, defaults or {}), _list_frames(frames)
-    if source.loaded is not None and (defaults or frames is not None or parallel.in_parts):
+    if not source.has_file and (defaults or frames is not None or parallel.in_parts):
         raise NergError(
             "a scene in memory has one picture, which is rendered at once; save the scene, and pass its file"
         )
@@ -248,7 +248,7 @@ class Drawing:
 
 @dataclass(frozen=True)
 class _FilmTask:
-    scene: FilmScene
+    scene: SceneSequence
     frames: Sequence[Frame]
     settings: FrameSettings
     drawing: Drawing | None
@@ -312,17 +312,17 @@ def _check_output(output: Path, overlay: str | None, look: Mapping[str, Any], is
         )
 
 
-def _open_scene(scene: Any, defaults: Frame) -> FilmScene:
+def _open_scene(scene: Any, defaults: Frame) -> SceneSequence:
     """Return a scene with values of its `<default>`s. Raises `NergError` if there is no such file."""
     if isinstance(scene, (str, os.PathLike)):
         if not os.path.exists(scene):
             raise NergError(f'there is no scene file "{scene}"')
-        return FilmScene(Path(scene), defaults)
+        return SceneSequence(Path(scene), defaults)
     opened = Scene.coerce(scene)
     if opened.source is None:
-        return FilmScene(Path("scene in memory"), defaults, opened.mitsuba)
+        return SceneSequence(Path("scene in memory"), defaults, opened.mitsuba)
     path, values = opened.source
-    return FilmScene(path, {**values, **defaults})
+    return SceneSequence(path, {**values, **defaults})
 
 
 def _list_frames(frames: Any) -> Sequence[Frame]:
@@ -435,9 +435,9 @@ def _render_in_parts(
 
 
 @contextmanager
-def _open_part(settings: FrameSettings, scene: PlannedFiles) -> Iterator[tuple[FilmScene, FrameRenderer]]:
+def _open_part(settings: FrameSettings, scene: PlannedFiles) -> Iterator[tuple[SceneSequence, FrameRenderer]]:
     """Yield the scene of a part, and what renders it."""
-    source = FilmScene(scene.checked_path(), scene.defaults)
+    source = SceneSequence(scene.checked_path(), scene.defaults)
     activate_variant(settings.mode)
     with Interruption() as stop:
         yield source, FrameRenderer(source, settings, 1, SILENT, stop)

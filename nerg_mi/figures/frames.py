@@ -15,7 +15,6 @@ import numpy as np
 from nerg_mi.environment import bands
 from nerg_mi.environment.bands import ConstantWeightsTrial, SamplePace
 from nerg_mi.environment.rendering_files import DisplayRows, open_image_rows
-from nerg_mi.environment.scene_loading import list_scene_files
 from nerg_mi.environment.scene_sequence import SceneSequence
 from nerg_mi.environment.sensors import describe_observer
 from nerg_mi.errors import NergError, parameter, translate_mitsuba_errors
@@ -57,35 +56,21 @@ class FrameSettings:
     smoothing: float = SMOOTHING
 
 
-@dataclass(frozen=True)
-class FilmScene:
-    """A scene file with ``values`` of its `<default>`s, or a ``loaded`` scene in memory."""
-
-    path: Path
-    values: Frame
-    loaded: Any = None
-
-    def list_files(self, frame: Frame) -> list[Path]:
-        """Return the scene file and the files that it names; none for a scene in memory."""
-        return list_scene_files(self.path, {**self.values, **frame}) if self.loaded is None else []
-
-
 class FilmProvenance:
     """Makes the provenance of pictures: ``recorded`` settings in addition to those of rendering."""
 
-    def __init__(self, scene: FilmScene, settings: FrameSettings, recorded: Mapping[str, Any] | None = None):
+    def __init__(self, scene: SceneSequence, settings: FrameSettings, recorded: Mapping[str, Any] | None = None):
         self._scene, self._settings, self._checksums = scene, settings, dict[Path, str]()
         self._recorded = {"mode": settings.mode, "sensor": settings.sensor, "spp": settings.spp, **(recorded or {})}
 
     def make(self, frame: Frame) -> Provenance:
         """Return the provenance of the picture of a frame."""
-        values = {**self._scene.values, **frame}
-        return self._make(self._scene.list_files(frame), {"defaults": values})
+        return self._make(self._scene.list_files(frame), {"defaults": {**self._scene.values, **frame}})
 
     def make_video(self, first: Frame, more_files: Sequence[Path], fps: float) -> Provenance:
         """Return the provenance of a video."""
         files = [*self._scene.list_files(first), *more_files]
-        return self._make(files, {"defaults": dict(self._scene.values), "fps": fps})
+        return self._make(files, {"defaults": self._scene.values, "fps": fps})
 
     def _make(self, files: Iterable[Path], more: Mapping[str, Any]) -> Provenance:
         return make_provenance("nerg render", files, self._settings.seed, {**self._recorded, **more}, self._checksums)
@@ -209,13 +194,12 @@ class FrameRenderer:
     """
 
     def __init__(
-        self, scene: FilmScene, settings: FrameSettings, num_frames: int, reporter: Reporter, stop: Interruption
+        self, scene: SceneSequence, settings: FrameSettings, num_frames: int, reporter: Reporter, stop: Interruption
     ):
         self.size, self.channels, self.undivided_reason, self.observer_note = (0, 0), 3, None, ""
         self._scene, self._settings, self._num_frames = scene, settings, num_frames
         self._reporter, self._stop = reporter, stop
         self._start, self._num_done = time.perf_counter(), 0
-        self._sequence = SceneSequence(scene.path)
         self._pace, self._trial = SamplePace(), ConstantWeightsTrial(num_frames)
 
     def render(self, frame: Frame, provenance: FilmProvenance) -> RenderedPicture:
@@ -257,9 +241,7 @@ class FrameRenderer:
 
     def _load(self, frame: Frame) -> tuple[Any, Any]:
         """Return the scene of a frame and the sensor."""
-        loaded = self._scene.loaded
-        if loaded is None:
-            loaded = self._sequence.load({**self._scene.values, **frame})
+        loaded = self._scene.load(frame)
         self._stop.check()
         if not self.observer_note and (note := describe_observer(loaded)):
             self.observer_note = note

@@ -21,7 +21,7 @@ from .page import Page
 from .scene import ParticipantsPanel
 from .server import RequestGuard, is_loopback, make_token, require_viser, start_server
 from .session import Session, SessionSettings
-from .source import ViewerScene, open_viewer_scene
+from .source import ViewerInputs, open_viewer_inputs
 
 
 class Viewer:
@@ -152,10 +152,10 @@ def view(
     variant = activate_mitsuba().variant()
     with open_reporter(progress) as reporter, ExitStack() as resources:
 
-        def load() -> ViewerScene:
+        def load() -> ViewerInputs:
             # On the render thread.
             activate_variant(variant)
-            return open_viewer_scene(inputs, observer=observer, up=up, align=align, reporter=reporter)
+            return open_viewer_inputs(inputs, observer=observer, up=up, align=align, reporter=reporter)
 
         server = start_server(guard, port, "nerg view")
         page = Page(server)

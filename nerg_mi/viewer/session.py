@@ -51,7 +51,7 @@ from .points import (
     render_frame,
 )
 from .shares import AttentionShare, iter_attention_shares
-from .source import ViewerScene
+from .source import ViewerInputs
 from .tracks import Tracks
 from .worker import Worker
 
@@ -136,7 +136,7 @@ class Session:
         Receives events.
     """
 
-    def __init__(self, load_source: Callable[[], ViewerScene], settings: SessionSettings, listener: Listener):
+    def __init__(self, load_source: Callable[[], ViewerInputs], settings: SessionSettings, listener: Listener):
         self.settings, self.listener = settings, listener
         self._load_source = load_source
         self.worker = Worker(listener.on_error)

@@ -38,8 +38,8 @@ _SUFFIXES = {*KINDS, *READERS, ".safetensors", ".rays"}
 
 
 @dataclass(frozen=True, eq=False)
-class ViewerScene:
-    """Scene of the viewer, and the objects that it is loaded from.
+class ViewerInputs:
+    """What the viewer opens, and loads scenes from.
 
     Attributes
     ----------
@@ -108,14 +108,14 @@ class ViewerScene:
         return document.with_gaze(chosen.path) if chosen is not None and chosen.path is not None else document
 
 
-def open_viewer_scene(
+def open_viewer_inputs(
     inputs: Any,
     *,
     observer: Sequence[float] | None = None,
     up: Sequence[float] | None = None,
     align: AnySimilarity | FilePath | None = None,
     reporter: Reporter = SILENT,
-) -> ViewerScene:
+) -> ViewerInputs:
     """Return the scene of ``inputs``: a scene with `nerg` and a camera, or one that `place_scene` makes.
 
     A folder is replaced by the files in it, at most one of a kind, or is a dataset of rays (.rays). Rays are shown in
@@ -144,7 +144,7 @@ def open_viewer_scene(
     if scene is not None:
         upward = _normalize(np.array([0.0, 0, 1]) if up is None else up)
         choices = name_gaze(gaze, reporter, scene.integrator.children.get("gaze"))
-        source = ViewerScene(name, rays, placed or Similarity(), upward, choices, [], scene, None)
+        source = ViewerInputs(name, rays, placed or Similarity(), upward, choices, [], scene, None)
         if scene.source is None:
             return source
         # The viewer changes settings of its scene, so that of the caller is loaded again.
@@ -159,7 +159,7 @@ def open_viewer_scene(
     named = (shown.environment.path, None if choices or not gaze else gaze[0].path, shown.rays_file)
     files = [file for path in named if path is not None for file in list_scene_files(path)]
     document, upward = SceneDocument.parse(made.text.to_xml(), name), _normalize(made.text.up if up is None else up)
-    return ViewerScene(
+    return ViewerInputs(
         name, rays, placed, upward, choices, files, None, document, made.volumes, made.text.content.shapes
     )
 

@@ -22,7 +22,7 @@ from nerg_mi.errors import parameter
 from nerg_mi.fields.splats import Splats
 from nerg_mi.progress import SilentReporter, open_reporter
 from nerg_mi.tasks.settings import Parallel
-from nerg_mi.viewer.source import open_viewer_scene
+from nerg_mi.viewer.source import open_viewer_inputs
 from tests.conftest import ROOT
 
 QUICK = {"recipe": "small", "steps": 2, "probes": 8, "directions": 64, "min_rays": 8, "validation_zones": 0}
@@ -314,7 +314,7 @@ def test_environments_are_shown(rgb_module, rays, tmp_path, kind):
         # Without the objects, from the files of the training.
         report = nerg.report(tmp_path / "gaze.safetensors", width=24, spp=1, viewpoints=1)
         assert "density" in written.integrator.children and len(report.html) > 10_000
-    shown = open_viewer_scene([environment, gaze]).load("")
+    shown = open_viewer_inputs([environment, gaze]).load("")
     np.testing.assert_allclose(depths(shown), depths(written), atol=1e-4)
 
 

@@ -16,7 +16,7 @@ from nerg_mi.fields.mlp import namespace
 from nerg_mi.formats.fields import save_gaze
 from nerg_mi.maths.geometry import Box
 from nerg_mi.viewer.session import Session, SessionSettings
-from nerg_mi.viewer.source import open_viewer_scene
+from nerg_mi.viewer.source import open_viewer_inputs
 
 # ---- A simple room with an analytic solution ----
 
@@ -122,7 +122,7 @@ def make_session():
 
     def make(path, *other_files, **options) -> Session:
         settings = SessionSettings(**{"compile": False, **options})
-        load = lambda: open_viewer_scene([path, *other_files], observer=settings.observer)
+        load = lambda: open_viewer_inputs([path, *other_files], observer=settings.observer)
         session = Session(load, settings, CountingListener())
         made.append(session)
         session.start()

@@ -21,7 +21,7 @@ from nerg_mi.viewer.layers import STALE_STYLE, DisplaySettings, Scale, get_layer
 from nerg_mi.viewer.points import PinholeView
 from nerg_mi.viewer.scene import copy_view
 from nerg_mi.viewer.shares import AttentionShare
-from nerg_mi.viewer.source import open_viewer_scene
+from nerg_mi.viewer.source import open_viewer_inputs
 from nerg_mi.viewer.worker import Worker
 
 # ---- Boxes fitted to a rectangle ----
@@ -103,7 +103,7 @@ def test07_copied_view_is_a_scene(store, tmp_path):
     settings = SimpleNamespace(width=48)
     view = PinholeView.look_at((7, 3, 2), (5, 4, 1), (0, 0, 1), 0.9, 1.5)
     shown = SimpleNamespace(
-        source=open_viewer_scene(store),
+        source=open_viewer_inputs(store),
         gaze_name="",
         display=DisplaySettings(get_layer("gaze")),
         observer=np.array([5, 3, 1.6]),
@@ -117,7 +117,7 @@ def test07_copied_view_is_a_scene(store, tmp_path):
     assert scene.integrator.aov_names() == ["depth.T", "opacity.Y", "gaze.Y"] and np.allclose(
         scene.observer, [5, 3, 1.6]
     )
-    shown.source = open_viewer_scene(trimesh.creation.box((4, 3, 2.5)), observer=(0, 0, 0))
+    shown.source = open_viewer_inputs(trimesh.creation.box((4, 3, 2.5)), observer=(0, 0, 0))
     with pytest.raises(NergError, match="objects in memory"):
         copy_view(shown, view)
 
