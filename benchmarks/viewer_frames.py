@@ -112,6 +112,7 @@ def measure(scene: Path, width: int, seconds: float, compile: bool) -> list[list
 
 
 def main(argv=None) -> None:
+    from nerg_mi.cli.declarations import select_backend
     from timing import save_result
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -119,6 +120,7 @@ def main(argv=None) -> None:
     parser.add_argument("--width", type=int, default=640, help="width of the full resolution, pixels (default: 640)")
     parser.add_argument("--seconds", type=float, default=4, help="length of a movement (default: 4)")
     args = parser.parse_args(argv)
+    select_backend("llvm_ad_rgb")
     rows = []
     for compile in (True, False):
         rows += measure(args.scene, args.width, args.seconds, compile)

@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
 import re
+import subprocess
+import sys
+import textwrap
 
 import numpy as np
 import pytest
+from nerg_mi.scenes.store import SCENE_FILE
 
 from tests.conftest import ROOT
 from tests.test_docs import check_command, commands
@@ -163,6 +168,27 @@ def test_variants_of_the_paper_are_compared_fold_by_fold(benchmark):
     assert row[:4] == ["room", "paper", "0.600", "0.500, 0.700"] and row[-2:] == ["960", "10"]
     assert row[4].startswith("+0.000 ± ") and row[5:7] == ["", ""]
     assert claims.order(rows[::2])[0][4] == "+0.100"
+
+
+def test_viewer_frames_of_a_new_process(tmp_path):
+    """It chooses a variant itself; without the compiled copy, which takes long to make."""
+    pytest.importorskip("viser")
+    code = """
+    import sys
+    from pathlib import Path
+    import viewer_frames
+    from tools import results
+
+    results.LATEST, measure = Path(sys.argv[1]), viewer_frames.measure
+    viewer_frames.measure = lambda *args: [] if args[-1] else measure(*args)
+    viewer_frames.main([sys.argv[2], "--width", "64", "--seconds", "0.5"])
+    """
+    path = os.pathsep.join(map(str, (ROOT, ROOT / "benchmarks")))
+    line = [sys.executable, "-c", textwrap.dedent(code), str(tmp_path), str(SCENE_FILE)]
+    subprocess.run(line, env={**os.environ, "PYTHONPATH": path}, check=True)
+    made, published = results.read("viewer", tmp_path), results.read("viewer")
+    assert made["columns"] == published["columns"]
+    assert [row[:2] for row in made["rows"]] == [row[:2] for row in published["rows"][2:]]
 
 
 SCRIPTS = sorted(p.stem for p in (ROOT / "benchmarks").glob("*.py") if "__main__" in p.read_text(encoding="utf-8"))
