@@ -92,7 +92,7 @@ class GazeFieldVolume(make_volume_class()):
     plugin = "gazefield"
 
     def __init__(self, props, network=None):
-        # ``network``: a field in memory instead of a file; see ``of``.
+        # ``network``: a field in memory instead of a file; see ``from_network``.
         super().__init__(props)
         self.field, self.metadata, self.filename = load_network(props, network, load_gaze, namespace(mi.Float))
         if not read_boolean(props, "reaimed_hits", True) and self.field.hits is not None:

@@ -86,7 +86,7 @@ class NerfVolume(make_volume_class()):
     plugin = "nerf"
 
     def __init__(self, props, network=None):
-        # ``network``: a field in memory instead of a file; see ``of``.
+        # ``network``: a field in memory instead of a file; see ``from_network``.
         similarity = Similarity(read_transform(props, "to_world"))
         field, metadata, filename = load_network(props, network, load_radiance, namespace(mi.Float))
         # Mitsuba's own media use the box of the base class, which it derives from the unit cube, and not bbox().

@@ -143,14 +143,15 @@ Neural radiance and gaze fields (:monosp:`nerg`)
 
 docs/explanation/error-and-time.md measures what each default contributes.
 
-This integrator marches through a radiance field, or any pair of volumes, and evaluates a gaze field on the surface that
-each ray meets: :math:`G(p_{od}, p_o) = F_e(p_{od}, -r_o)\,\mathrm{sigmoid}(F_c(p_o, r_o))` (equation 1 of the paper),
-with the observer :math:`p_o`, the direction :math:`r_o` to the surface, and the surface :math:`p_{od}` that the
-*observer* sees along it. If the observer is not at the camera, a second, density-only march from :math:`p_o` finds
+This integrator marches through a radiance field, or any pair of volumes, to the surface of each ray, and evaluates a
+gaze field for the observer :math:`p_o` in the direction :math:`r_o` to that surface: :math:`G(p_{od}, p_o) =
+F_e(p_{od}, -r_o)\,\mathrm{sigmoid}(F_c(p_o, r_o))` (equation 1 of the paper), with the surface :math:`p_{od}` that the
+*observer* sees along :math:`r_o`. The default gaze field divides this product by its integral over all directions, and
+mixes in a prior. If the observer is not at the camera, a second, density-only march from :math:`p_o` finds
 :math:`p_{od}` and the visibility :math:`1 - \mathrm{clip}((d_{o*} - d_o - \mathrm{tolerance}) / d_f, 0, 1)`, by which
 gaze is multiplied.
 
-AOVs (0 on rays without a surface):
+AOVs:
 
 {aovs}
 
@@ -234,7 +235,6 @@ from nerg_mi.properties import (
 from nerg_mi.ranges import COORDINATES, MAX_COORDINATE, POSITIVE_VALUES, Range
 from nerg_mi.registration import register
 from nerg_mi.transport import aovs as nerg_aovs
-from nerg_mi.transport import observer
 from nerg_mi.transport.depth import DEPTHS
 from nerg_mi.transport.geometry import HEADLIGHT, Ceiling, Shading
 from nerg_mi.transport.jit import gc_paused, is_recording
@@ -246,7 +246,16 @@ from nerg_mi.transport.march_primal import (
     default_stop,
 )
 from nerg_mi.transport.medium import Medium
-from nerg_mi.transport.observer import VISIBILITIES, ObserverCache, ObserverSettings, check_center, sensor_center
+from nerg_mi.transport.observer import (
+    VISIBILITIES,
+    ObserverCache,
+    ObserverSettings,
+    check_center,
+    check_centers,
+    is_batch,
+    sensor_center,
+    sensor_centers,
+)
 from nerg_mi.transport.observer_gaze import GazeFieldInstance
 from nerg_mi.transport.quadrature import RULES, cells_for_rule
 from nerg_mi.transport.recording import FrozenChildren, Recorder
@@ -520,7 +529,7 @@ class NergIntegrator(mi.SamplingIntegrator):
         if isinstance(sensor, int):
             sensor = scene.sensors()[sensor]
         if self.observer is None and self.context().observer_aovs:
-            observer.check_centers(sensor)
+            check_centers(sensor)
         restore_interrupt_handler()
         with self.rendering_from(sensor, scene), gc_paused():
             image = super().render(scene, sensor, seed, spp, develop, evaluate)
@@ -543,10 +552,8 @@ class NergIntegrator(mi.SamplingIntegrator):
     def render_forward(self, scene, params, sensor, seed: Any = 0, spp=0):
         # Mitsuba 3.9.1 aborts the process in this case, also for its own integrators: a batch calls its cameras through
         # a table of all sensors, including the observer.
-        centers = observer.sensor_centers([sensor]) + (
-            [] if self.observer is None else [observer.sensor_center(self.observer)]
-        )
-        if observer.is_batch(sensor) and any(dr.grad_enabled(c) for c in centers):
+        centers = sensor_centers([sensor]) + ([] if self.observer is None else [sensor_center(self.observer)])
+        if is_batch(sensor) and any(dr.grad_enabled(c) for c in centers):
             raise NergError(
                 'a "batch" of cameras has no forward derivatives with respect to the pose of an observer or a camera; '
                 "render its cameras one by one, or use reverse mode (dr.backward)"

@@ -15,14 +15,26 @@ from nerg_mi.errors import NergError
 from nerg_mi.maths.color import composite_to_linear
 from nerg_mi.maths.types import Bool, Color, Float, Point3f, Ray3f, Vector3f
 from nerg_mi.transport import aovs as nerg_aovs
-from nerg_mi.transport import observer
 from nerg_mi.transport.depth import DEPTHS
 from nerg_mi.transport.field_medium import FeatureShader, make_color_shader
 from nerg_mi.transport.geometry import SceneGeometry
 from nerg_mi.transport.jit import is_recording
 from nerg_mi.transport.march_primal import MarchResult
 from nerg_mi.transport.medium import SampleShader
-from nerg_mi.transport.observer import CacheEntry, ObserverCache, ObserverView, observe_view, select_nearest
+from nerg_mi.transport.observer import (
+    CacheEntry,
+    ObserverCache,
+    ObserverView,
+    camera_windows,
+    center_of_ray,
+    check_centers,
+    distance_and_direction,
+    have_same_center,
+    observe_view,
+    select_nearest,
+    sensor_center,
+    sensor_centers,
+)
 from nerg_mi.transport.observer_gaze import (
     GazeFieldInstance,
     ObservedGaze,
@@ -112,7 +124,7 @@ class RenderContext:
     def list_inputs(self, scene: mi.Scene, sensors: Sequence[mi.Sensor], lanes: int) -> list[Any]:
         """All objects that ``lanes`` rays of ``sensors`` read, for a recording. Raises `NotRecordable`."""
         nerg = self.nerg
-        geometry = see_from_camera(SceneGeometry(nerg.medium, scene), sensors, count_rays(sensors, lanes))
+        geometry = see_from_camera(SceneGeometry(nerg.medium, scene), sensors, count_pixels(sensors, lanes))
         self.seen[:] = [geometry]
         inputs = list_geometry_inputs(geometry)
         if nerg.gaze is not None:
@@ -126,10 +138,10 @@ class RenderContext:
         is_camera = self.nerg.observer is None
         if is_camera:
             for sensor in sensors:
-                observer.check_centers(sensor)
-            (center,) = observer.sensor_centers(sensors)
+                check_centers(sensor)
+            (center,) = sensor_centers(sensors)
         else:
-            center = observer.sensor_center(self.nerg.observer)
+            center = sensor_center(self.nerg.observer)
         p_o = arrays.Point3f(center)
         dr.make_opaque(p_o)
         return ObserverContext(p_o, [p_o], self.nerg.cache, True if is_camera else None)
@@ -187,18 +199,18 @@ class ObserverContext:
         """Compute all that an evaluation of ``lanes`` rays of ``sensors`` reads: a recording cannot compute it."""
         geometry = SceneGeometry(context.nerg.medium, scene)
         if self.is_at_camera is None:
-            self.is_at_camera = observer.have_same_center(sensors, self.p_o)
+            self.is_at_camera = have_same_center(sensors, self.p_o)
         if "gaze" in context.required_data:
             self.gaze(context, geometry).prepare(lanes)
         if context.nerg.occlusion and not self.is_at_camera and context.needs_visibility:
             self.map(context, geometry)
-            self.seen = geometry.seen_from(self.p_o, count_rays(sensors, lanes))
+            self.seen = geometry.seen_from(self.p_o, count_pixels(sensors, lanes))
         for name, view in context.views.items():
             self.view(name, view)
 
 
-def count_rays(sensors: Sequence[mi.Sensor], lanes: int) -> int:
-    """Rays of whole images of ``sensors``; without any, ``lanes``."""
+def count_pixels(sensors: Sequence[mi.Sensor], lanes: int) -> int:
+    """Pixels of whole images of ``sensors``; without any, ``lanes``."""
     return sum(int(dr.prod(s.film().crop_size())) for s in sensors) or lanes
 
 
@@ -207,10 +219,10 @@ def see_from_camera(geometry: SceneGeometry, sensors: Sequence[mi.Sensor], num_r
     # Windows are computed for splats only.
     if len(sensors) != 1 or not isinstance(geometry.medium, SplatMedium):
         return geometry
-    windows = observer.camera_windows(sensors[0])
+    windows = camera_windows(sensors[0])
     if windows is None:
         return geometry
-    return geometry.seen_from(observer.sensor_center(sensors[0]), num_rays, windows)
+    return geometry.seen_from(sensor_center(sensors[0]), num_rays, windows)
 
 
 class CameraView:
@@ -245,7 +257,7 @@ class CameraView:
         medium = context.nerg.medium
         self.geometry = SceneGeometry(medium, scene)
         # Rays of the whole image, of which this may be a strip.
-        self.num_rays = count_rays(sensors, dr.width(ray.o))
+        self.num_rays = count_pixels(sensors, dr.width(ray.o))
         traced = self.geometry
         if context.seen:
             (traced,) = context.seen
@@ -265,14 +277,13 @@ class CameraView:
         )
         self.has_matter = active & (self.ray_hit.opacity > 0)
 
-    def make_pixel(self, observer: ObserverContext | None = None, is_aligned: bool = False) -> Pixel:
-        """These rays for an observer; None: that of the context. ``is_aligned``: whether the observer is known to be at
-        the camera."""
-        return Pixel(self, observer, is_aligned)
+    def make_pixel(self, observer: ObserverContext | None = None) -> Pixel:
+        """These rays for an observer; None: that of the context."""
+        return Pixel(self, observer)
 
     def make_pixel_per_origin(self) -> Pixel:
         """Each ray for an observer at its own origin, for fields that are not normalised per observer."""
-        return Pixel(self, ObserverContext(self.camera_ray.o, [], ObserverCache()), True)
+        return Pixel(self, ObserverContext(self.camera_ray.o, [], ObserverCache(), True))
 
     def compute_channels(self, aovs: Sequence[str]) -> list[Float]:
         """All channels of AOVs that do not depend on the observer."""
@@ -373,9 +384,9 @@ class Pixel:
     """What ``camera`` sees, combined with an observer; computed part by part on first access. One object per observer.
     Arguments: see `CameraView.make_pixel`."""
 
-    def __init__(self, camera: CameraView, observer: ObserverContext | None, is_aligned: bool):
+    def __init__(self, camera: CameraView, observer: ObserverContext | None):
         self.camera, self.context = camera, camera.context
-        self._observer, self._is_aligned = observer, is_aligned
+        self._observer = observer
         self._evaluations: Float = arrays.Float(0)
 
     def compute_channels(self, aovs: Sequence[str]) -> list[Float]:
@@ -392,24 +403,22 @@ class Pixel:
             return self._observer
         context, camera = self.context, self.camera
         if context.nerg.observer is None:
-            p_o = observer.center_of_ray(camera.sensors, camera.camera_ray)
-            return ObserverContext(p_o, observer.sensor_centers(camera.sensors), context.nerg.cache, True)
-        p_o = observer.sensor_center(context.nerg.observer)
+            p_o = center_of_ray(camera.sensors, camera.camera_ray)
+            return ObserverContext(p_o, sensor_centers(camera.sensors), context.nerg.cache, True)
+        p_o = sensor_center(context.nerg.observer)
         return ObserverContext(p_o, [p_o], context.nerg.cache)
 
     @cached_property
     def is_aligned(self) -> bool:
         """Whether the observer is at the camera and therefore sees the same surfaces."""
-        if self._is_aligned:
-            return True
         if self.observer.is_at_camera is None:
-            self.observer.is_at_camera = observer.have_same_center(self.camera.sensors, self.observer.p_o)
+            self.observer.is_at_camera = have_same_center(self.camera.sensors, self.observer.p_o)
         return self.observer.is_at_camera
 
     @cached_property
     def distance_and_direction(self) -> tuple[Float, Vector3f]:
         """Distance and unit direction from the observer to the surface."""
-        return observer.distance_and_direction(self.observer.p_o, self.camera.p_d)
+        return distance_and_direction(self.observer.p_o, self.camera.p_d)
 
     @property
     def r_o(self) -> Vector3f:

@@ -105,7 +105,7 @@ class SplatsVolume(make_volume_class()):
     plugin = "splats"
 
     def __init__(self, props, splats=None):
-        # ``splats``: Gaussians in memory instead of a file; see ``of``.
+        # ``splats``: Gaussians in memory instead of a file; see ``from_network``.
         self.similarity = Similarity(read_transform(props, "to_world"))
         color_space = read_choice(props, "color_space", "file", ("file", "srgb", "linear"))
         extent = read_number(props, "extent", 3, Range(0.1, 10))

@@ -7,10 +7,10 @@ import math
 import re
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, cast, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import numpy as np
 
@@ -173,44 +173,36 @@ def get_base_seed(sampler) -> int | None:
 
 @functools.cache
 def _can_reproduce(base: int, variant: str) -> bool:
-    """Whether `make_strip_sampler` reproduces Mitsuba's sampler of this seed. If a release of Mitsuba seeds
+    """Whether `make_sampler` reproduces Mitsuba's sampler of this seed. If a release of Mitsuba seeds
     differently, images are rendered undivided and stay correct."""
     import drjit as dr
     import mitsuba as mi
 
     reference, count = mi.load_dict({"type": "independent", "seed": base}), 64
     reference.seed(7, count)
-    sampler_copy = make_strip_sampler(1, base, 7, 0, count)
+    sampler_copy = make_sampler(1, mi.UInt32((base + 7) & 0xFFFFFFFF), mi.UInt64(0), count)
     return bool(dr.all(reference.next_2d() == sampler_copy.next_2d(), axis=None))
 
 
-def make_strip_sampler(spp: int, base: int, seed: int, first: int, count: int):
+def make_sampler(spp: int, key: Any, first: Any, count: int):
     """Make a sampler for a range of samples of an image.
 
     Parameters
     ----------
     spp : int
         Samples per pixel.
-    base : int
-        Seed of the scene's sampler (`base_seed`).
-    seed : int
-        Seed of the rendering.
-    first, count : int
-        First sample and number of samples. Samples are numbered pixel by pixel.
+    key : mi.UInt32
+        Sum of the seeds of the scene's sampler (`get_base_seed`) and of the rendering. Neither this nor ``first`` is
+        compiled into the kernel if it is opaque.
+    first : mi.UInt64
+        First sample. Samples are numbered pixel by pixel.
+    count : int
+        Number of samples.
 
     Notes
     -----
     Mitsuba renders at most 2^32 samples at once; samples beyond that use other seeds.
     """
-    import drjit as dr
-
-    mi = variant_types()
-    return make_sampler(spp, dr.opaque(mi.UInt32, (base + seed) & 0xFFFFFFFF), dr.opaque(mi.UInt64, first), count)
-
-
-def make_sampler(spp: int, key: Any, first: Any, count: int):
-    """Make the sampler of `make_strip_sampler` from Dr.Jit numbers, which are not compiled into the kernel: the sum
-    ``key`` of base and seed, and the first sample."""
     import drjit as dr
 
     mi = variant_types()
@@ -263,26 +255,6 @@ Four bytes are in the block that accumulates samples, the others in copies on th
 """
 
 
-@runtime_checkable
-class ObserverIntegrator(Protocol):
-    """A Python integrator that renders like `mi.SamplingIntegrator`, within a context of its own."""
-
-    def rendering_from(self, sensor, scene) -> AbstractContextManager:
-        """Return a context manager. Inside it, rays passed to the integrator are camera rays of ``sensor``."""
-        ...
-
-
-def has_context(integrator: Any) -> bool:
-    """Whether ``integrator`` is an `ObserverIntegrator`."""
-    return _has_context(type(integrator))
-
-
-@functools.cache
-def _has_context(kind: type) -> bool:
-    # Python takes .2 ms to compare an object with a protocol.
-    return issubclass(kind, ObserverIntegrator)
-
-
 @dataclass(frozen=True)
 class Band:
     """A band of rows of an image.
@@ -314,7 +286,7 @@ def undividable_reason(scene, sensor) -> str | None:
         return f"the variant {mi.variant()}"
     if not isinstance(integrator, mi.SamplingIntegrator) or isinstance(integrator, mi.CppADIntegrator):
         return f"the integrator {integrator.class_name()}"
-    if not has_context(integrator) and _overrides_render(type(integrator), mi.SamplingIntegrator):
+    if not is_nerg(integrator) and _overrides_render(type(integrator), mi.SamplingIntegrator):
         return f"the integrator {integrator.class_name()}, which overrides render()"
     if film.class_name() != "HDRFilm":
         return f"the film {film.class_name()}"
@@ -386,17 +358,21 @@ def render_bands(
 
     Raises
     ------
+    NergError
+        There are ``layers``, and the image cannot be divided (`undividable_reason`).
     KeyboardInterrupt
         An undivided image was interrupted; Mitsuba handles the signal in this case.
     """
-    if undividable_reason(scene, sensor):
+    if reason := undividable_reason(scene, sensor):
+        if layers is not None:
+            raise NergError(f"this picture cannot be rendered because of {reason}; pass a Camera, or use mi.render")
         yield _render_undivided(scene, sensor, spp, seed, on_strip)
         return
     grid = _PixelGrid(sensor.film(), spp or sensor.sampler().sample_count(), rows)
     integrator = scene.integrator()
     if layers is None:
         layers = AovLayer(integrator, sensor) if is_nerg(integrator) else IntegratorLayer(integrator)
-    rendering_context = lambda: integrator.rendering_from(sensor, scene) if has_context(integrator) else nullcontext()
+    rendering_context = lambda: integrator.rendering_from(sensor, scene) if is_nerg(integrator) else nullcontext()
     base = cast("int", get_base_seed(sensor.sampler()))
     pace = pace or SamplePace()
     pace.begin()

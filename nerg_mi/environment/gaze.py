@@ -509,14 +509,12 @@ class GazeField(TrainedField[GazeNetwork]):
 
     def _make_space(self, medium: Any) -> ObserverSpace:
         """Return a space in the frame of the field, traced as in the training."""
-        from nerg_mi.transport.geometry import SURFACE_OPACITY, as_scene_geometry, default_march_settings
+        from nerg_mi.transport.geometry import as_scene_geometry, default_march_settings
         from nerg_mi.transport.observer import ObserverSettings
 
         scene_geometry = as_scene_geometry(medium)
         settings = ObserverSettings(
-            march=default_march_settings(scene_geometry),
-            depth=self.provenance.get("probes", {}).get("depth", "median"),
-            surface_opacity=SURFACE_OPACITY,
+            march=default_march_settings(scene_geometry), depth=self.provenance.get("probes", {}).get("depth", "median")
         )
         return ObserverSpace(scene_geometry, settings, Similarity())
 

@@ -12,7 +12,7 @@ from nerg_mi.fields.gaze_base import GazeNetwork
 from nerg_mi.maths.arrays import to_vector
 from nerg_mi.maths.types import variant_types
 from nerg_mi.transport.extrapolation import describe_extrapolation
-from nerg_mi.transport.geometry import SURFACE_OPACITY, SceneGeometry, default_march_settings, trace_depth
+from nerg_mi.transport.geometry import SceneGeometry, default_march_settings, trace_depth
 from nerg_mi.transport.observer import ObserverSettings
 from nerg_mi.transport.observer_gaze import GazeFieldInstance, make_gaze_evaluator
 
@@ -97,7 +97,7 @@ def sample_field(field: GazeNetwork, environment: Environment, **settings: Any) 
     """Return the gaze of ``field`` in an environment; ``settings`` are those of `ObserverSettings`."""
     geometry = environment.scene_geometry
     march = default_march_settings(geometry)
-    rays = ObserverSettings(march=march, surface_opacity=SURFACE_OPACITY, **settings)
+    rays = ObserverSettings(march=march, **settings)
     return GazeSampler(GazeFieldInstance(field), geometry, rays)
 
 

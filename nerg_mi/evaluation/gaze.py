@@ -21,7 +21,7 @@ from nerg_mi.tracking.filters import purge, split_by_person
 from nerg_mi.tracking.folds import sample_participants_equally
 from nerg_mi.tracking.probes import place_probes
 from nerg_mi.tracking.rays import Rays
-from nerg_mi.transport.geometry import SURFACE_OPACITY, SceneGeometry, default_march_settings
+from nerg_mi.transport.geometry import SceneGeometry, default_march_settings
 from nerg_mi.transport.observer import ObserverSettings
 from nerg_mi.transport.observer_batch import evaluate_densities
 from nerg_mi.transport.observer_gaze import GazeFieldInstance, ObservedGaze
@@ -87,7 +87,7 @@ class FieldDensity:
             medium if isinstance(medium, SceneGeometry) else SceneGeometry(medium),
         )
         march = default_march_settings(self._environment)
-        self._settings = ObserverSettings(march=march, depth=depth_kind, surface_opacity=SURFACE_OPACITY)
+        self._settings = ObserverSettings(march=march, depth=depth_kind)
         self._align, self._on_position = align or Similarity(), on_position
         self._observed: dict[bytes, ObservedGaze] = {}
 

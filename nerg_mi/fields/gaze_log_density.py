@@ -194,8 +194,10 @@ class LogGazeField(GazeHead):
         return sigmoid(self.capture_net(self.capture_inputs(self.capture_position(p_o), r_o))[0])
 
     def unnormalized(self, p_od, p_o, r_o, active: Bool | bool = True, semantic=None, escaped: Bool | bool = False):
-        """``(emit * prior, capture)``, whose product has the integral ``Z``. ``escaped``: mask of directions without a
-        surface; ``semantic`` is not used."""
+        """``(emit, capture)``, whose product has the integral ``Z``; emit contains the prior if it is a factor.
+
+        ``escaped``: mask of directions without a surface; ``semantic`` is not used.
+        """
         c, one = self.config, type(p_od.x)(1)
         logit = self.log_base(r_o)
         if c.variant != "capture":

@@ -236,12 +236,9 @@ def _render_layers(
     scene: Scene, sensor: Any, layers: _ObserverLayers, spp: int, seed: int, reporter: Reporter
 ) -> dict[str, Floats]:
     """Render all quantities, each with a first axis of observers."""
-    from nerg_mi.environment.bands import render_bands, undividable_reason
+    from nerg_mi.environment.bands import render_bands
     from nerg_mi.interruption import Interruption
 
-    reason = undividable_reason(scene.mitsuba, sensor)
-    if reason is not None:
-        raise NergError(f"this camera cannot be rendered for several observers because of {reason}; pass a Camera")
     with Interruption() as stop:
 
         def on_strip(done: int, total: int) -> None:

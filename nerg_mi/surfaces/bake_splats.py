@@ -34,7 +34,6 @@ from nerg_mi.transport.splat_medium import SplatArrays, SplatMedium
 
 from .bake_parts import UNITS, BakeInputs, Baker, compute_sums, load_alignment, make_gaze_groups, require_gaze
 from .laplacian import SurfaceSums, merge_sums
-from .mesh import SURFACE_OPACITY
 from .settings import BakeColors, BakeSampling
 from .sources import MakeObserver, RaySettings, TrackedRays, WeightedObservers, observers_from_field
 from .splats import (
@@ -218,7 +217,7 @@ class SplatBaker(Baker):
     @cached_property
     def settings(self) -> ObserverSettings:
         """How rays are traced."""
-        return ObserverSettings(march=default_march_settings(self.geometry), surface_opacity=SURFACE_OPACITY)
+        return ObserverSettings(march=default_march_settings(self.geometry))
 
     @cached_property
     def axes(self) -> np.ndarray:

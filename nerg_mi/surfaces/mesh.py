@@ -242,8 +242,6 @@ def _repeat_triangles(rows: np.ndarray, triangles) -> tuple[np.ndarray, np.ndarr
 
 # ---- Ray casts ----
 
-SURFACE_OPACITY = 0.5  # minimum opacity of a medium for a surface hit
-
 SELF_HIT_TOLERANCE = 1e-5
 """Relative distance within which a hit in front of a point does not occlude it, such as its own face or a neighbour."""
 
@@ -292,9 +290,7 @@ class SurfaceTarget:
         # The scene may wrap the shape in another object.
         self._shape = next(shape for shape in scene.shapes() if shape.id() == "surface")
         self.geometry = SceneGeometry(medium, scene)
-        self.settings = settings or ObserverSettings(
-            march=default_march_settings(self.geometry), surface_opacity=SURFACE_OPACITY
-        )
+        self.settings = settings or ObserverSettings(march=default_march_settings(self.geometry))
 
     @property
     def has_binary_visibility(self) -> bool:

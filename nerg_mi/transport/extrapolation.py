@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from nerg_mi.maths.sphere import fibonacci_directions
 
-from .geometry import SceneGeometry, shape_corners, trace_depth
+from .geometry import SURFACE_OPACITY, SceneGeometry, shape_corners, trace_depth
 from .mitsuba_mesh import count_faces, is_mesh, read_triangles
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ def _is_in_solid(geometry: SceneGeometry, lower: np.ndarray, upper: np.ndarray, 
         d = fibonacci_directions(_SOLID_DIRECTIONS)
         rays = np.repeat(positions, len(d), axis=0), np.tile(d, (len(positions), 1))
         depth, opacity = trace_depth(geometry, *rays)
-        reach = np.where(opacity > 0.5, depth, np.inf).reshape(len(positions), -1).max(axis=1)
+        reach = np.where(opacity > SURFACE_OPACITY, depth, np.inf).reshape(len(positions), -1).max(axis=1)
         inside |= reach < _SOLID_DEPTH * np.linalg.norm(upper - lower)
     parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     for shape in [] if geometry.scene is None else geometry.scene.shapes():

@@ -14,7 +14,7 @@ from nerg_mi.fields.gaze_base import RaySupport
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.types import Float, Point3f, Ray3f, Vector3f, variant_types
 
-from .geometry import SceneGeometry
+from .geometry import SURFACE_OPACITY, SceneGeometry
 from .jit import Fingerprint, fingerprint_shapes, is_recording
 from .march_primal import MarchSettings
 from .recording import Recorder
@@ -174,7 +174,7 @@ class ObserverSettings:
     # Kind of depth of a surface (a name in `depth.DEPTHS`).
     depth: str = "median"
     # Minimum opacity of a surface.
-    surface_opacity: float = 0.5
+    surface_opacity: float = SURFACE_OPACITY
     # One of ``VISIBILITIES``: how occlusion is decided.
     visibility: str = "depth"
     # Depth tolerance of a surface; 0: two steps, or without a medium a fraction of the scene.

@@ -322,17 +322,19 @@ class GazeFieldInstance:
         samples = cache.get_or_compute_each(
             (self, "surroundings"), observers, made_of, lambda center: SphereSampleCache()
         )
-        made_of = (*made_of, settings.directions, settings.integral_tolerance)
+        depends_on = (*made_of, settings.directions, settings.integral_tolerance)
         integrals = []
         for member in self.field.members:
-            integral = _SphereIntegral(self, member, geometry, settings, cache.recorder)
+            integrator = _MemberIntegrator(self, member, geometry, settings, cache.recorder)
             parameters = list(member.parameters().values())
             if dr.grad_enabled(parameters):
-                entries = [CacheEntry(k.center, integral.attached(k)) for k in samples]
+                entries = [CacheEntry(k.center, integrator.integrate_with_derivatives(k)) for k in samples]
             else:
-                of_member = (made_of, Fingerprint(parameters))
-                entries = cache.get_or_compute_scalar((self, "integral", member), samples, of_member, integral.detached)
-            integrals.append([integral.moving(k, p_o) for k, p_o in zip(entries, observers)])
+                of_member = (depends_on, Fingerprint(parameters))
+                entries = cache.get_or_compute_scalar(
+                    (self, "integral", member), samples, of_member, integrator.integrate
+                )
+            integrals.append([integrator.attach_to_position(k, p_o) for k, p_o in zip(entries, observers)])
         hits = []
         if (reaimed := self.field.hits) is not None:
 
@@ -364,7 +366,7 @@ class GazeFieldInstance:
 
 
 @dataclass(frozen=True)
-class _SphereIntegral:
+class _MemberIntegrator:
     """The integral of one ``member`` of the ``placed`` field over the sphere around observers in ``geometry``.
 
     Observers are `CacheEntry` objects with a `SphereSampleCache`.
@@ -376,20 +378,20 @@ class _SphereIntegral:
     settings: ObserverSettings
     recorder: Recorder | None = None
 
-    def detached(self, entry: CacheEntry) -> Float:
+    def integrate(self, entry: CacheEntry) -> Float:
         """The value of the integral (one lane)."""
         if is_recording():
             with dr.suspend_grad():
-                return self.attached(entry)
+                return self.integrate_with_derivatives(entry)
         return dr.opaque(type(entry.center.x), self._integrate(entry).value)
 
-    def attached(self, entry: CacheEntry) -> Float:
+    def integrate_with_derivatives(self, entry: CacheEntry) -> Float:
         """The same with derivatives. A recorded function, which is replayed with other values, sums over all
         directions."""
         count = self.settings.directions if is_recording() else self._integrate(entry).directions
         return dr.mean(self._integrand(entry, self._around(entry, count))) * (4 * dr.pi)
 
-    def moving(self, entry: CacheEntry, p_o: Point3f) -> CacheEntry:
+    def attach_to_position(self, entry: CacheEntry, p_o: Point3f) -> CacheEntry:
         """Attach the integral to the position ``p_o`` of its observer, if that carries gradients.
 
         Central differences of sums over the same directions: occlusion moves with the observer.

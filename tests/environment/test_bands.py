@@ -390,12 +390,12 @@ def test_random_numbers_equal_undivided_image(rgb, base, seed):
     assert bands.get_base_seed(sampler) == base
     sampler.seed(seed, 1000)
     theirs = np.array([sampler.next_1d(), *sampler.next_2d()])
-    part = bands.make_strip_sampler(2, base, seed, 137, 500)
+    part = bands.make_sampler(2, rgb.UInt32((base + seed) & 0xFFFFFFFF), rgb.UInt64(137), 500)
     assert np.array_equal(np.array([part.next_1d(), *part.next_2d()]), theirs[:, 137:637])
 
 
 def test_sampler_clone_is_independent(rgb):
-    sampler = bands.make_strip_sampler(1, 0, 0, 0, 10)
+    sampler = bands.make_sampler(1, rgb.UInt32(0), rgb.UInt64(0), 10)
     copy = sampler.clone()
     first = np.array(sampler.next_1d())
     assert np.array_equal(np.array(copy.next_1d()), first)
@@ -403,7 +403,9 @@ def test_sampler_clone_is_independent(rgb):
 
 
 def test_random_numbers_beyond_2_to_32(rgb):
-    near, far = (np.array(bands.make_strip_sampler(1, 0, 0, first, 64).next_1d()) for first in (0, 1 << 32))
+    near, far = (
+        np.array(bands.make_sampler(1, rgb.UInt32(0), rgb.UInt64(first), 64).next_1d()) for first in (0, 1 << 32)
+    )
     assert not np.any(near == far)
 
 
