@@ -194,7 +194,7 @@ class Areas:
         if path.is_dir():
             return cls(tuple(read_twin_objects(path)), path, tuple(list_twin_files(path)))
         read = _parse_areas(read_area_entries(path), path, f'"{path}"')
-        return replace(read, path=path, files=tuple(dict.fromkeys([path, *read.meshes, *read.files])))
+        return replace(read, path=path, files=(path, *read.files))
 
     @classmethod
     def open(cls, areas: FilePath | AnyAreas, name: str = "areas") -> Areas:
@@ -410,8 +410,7 @@ _READING_EXAMPLE = (
 
 
 def _parse_areas(entries: Iterable[AreaEntry], path: Path, source: str) -> Areas:
-    """Parse entries; ``path`` is the file that meshes and recordings are next to. ``files`` are those of
-    recordings."""
+    """Parse entries; ``path`` is the file that meshes and recordings are next to, and none of ``files``."""
     areas: list[Area] = []
     twins: list[Path] = []
     for entry in entries:
@@ -427,9 +426,10 @@ def _parse_areas(entries: Iterable[AreaEntry], path: Path, source: str) -> Areas
         if len(areas) > MAX_AREAS:
             raise NergError(f'{source} has more than {MAX_AREAS} areas; select some of the objects with "categories"')
     try:
-        return Areas(tuple(areas), files=tuple(twins))
+        parsed = Areas(tuple(areas))
     except NergError as error:
         raise NergError(f"{source}: {error}") from error
+    return replace(parsed, files=tuple(dict.fromkeys([*parsed.meshes, *twins])))
 
 
 def _parse_non_box(entry: AreaEntry, path: Path) -> list[Area]:

@@ -191,6 +191,7 @@ def statistics(
     chosen = _open_inputs(inputs)
     areas = Areas.open(aois, "aois")
     zones = to_json_values(zones) if isinstance(zones, Mapping) else zones
+    zone_areas = None if zones is None else Areas.open(zones, "zones")
     what_if = to_json_values(what_if) if isinstance(what_if, Mapping) else what_if
     if align is not None and not isinstance(align, (str, os.PathLike)):
         align = open_similarity(align, "rays to scene").matrix.tolist()
@@ -198,14 +199,15 @@ def statistics(
     counting = Counting(
         rules,
         _make_windows(windows or {}),
-        () if zones is None else tuple(Areas.open_boxes(zones, "zones")),
+        () if zone_areas is None else tuple(Areas.open_boxes(zone_areas, "zones")),
         None if cohorts is None else to_path(cohorts),
         aoi_visibility,
         fov,
         error,
         None if validation is None else to_path(validation),
     )
-    files = existing_files(chosen.environment, chosen.gaze, chosen.rays, areas.path, what_if)
+    files = existing_files(*chosen, *areas.files, what_if, align, cohorts, validation)
+    files += [] if zone_areas is None else zone_areas.files
     plain = {
         "aois": areas.path or (str(aois) if isinstance(aois, (str, os.PathLike)) else None),
         "zones": zones.path if isinstance(zones, Areas) else zones,
@@ -230,6 +232,7 @@ def statistics(
             work.check(what_if, power)
             # Errors in changes are reported before anything is counted.
             changes = None if what_if is None else open_changes(what_if)
+            files += [] if changes is None else changes.meshes
             attention = work.measure(viewpoints, eyes, grid)
             result = work.make_tables(attention, power, show_names, salt)
             if changes is not None and attention.predicted is not None:

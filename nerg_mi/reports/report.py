@@ -349,7 +349,7 @@ class ReportBuilder:
             out.append(("rays", Path(rays).name, hash_rays(rays)))
         files = [e for e in self.inputs.evaluations if isinstance(e, Path)]
         out += [("evaluation", f"{path.parent.name}/{path.name}", file_sha256(path)) for path in files]
-        return out if areas.path is None else [*out, describe("objects", areas.path)]
+        return [*out, *(describe("objects", path) for path in areas.files)]
 
     def _step(self, share: float, text: str) -> None:
         self.stop.check()

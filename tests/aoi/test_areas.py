@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -108,6 +109,7 @@ def test01_one_area_of_each_kind(tmp_path):
     with pytest.raises(NergError, match="face 9"):
         areas.areas[1].select_faces(9)
     assert areas.path == path and areas.files == (path, tmp_path / "sign.ply") and areas.boxes == [areas.areas[0]]
+    assert Areas.load({"tile": {"mesh": "tile.obj"}}).files == (Path("tile.obj"),)
     # The viewer shows only boxes, and preserves the others when it saves the file.
     assert json.loads(format_areas(areas.areas, tmp_path)) == json.loads(path.read_text())
 

@@ -10,14 +10,16 @@ import numpy as np
 import pytest
 
 from nerg_mi.aoi import statistics as module
-from nerg_mi.aoi.settings import AoiSampling, VisitRules
+from nerg_mi.aoi.settings import AoiSampling, TrackerError, VisitRules
 from nerg_mi.aoi.statistics import statistics
 from nerg_mi.aoi.tables import MAX_COMPARED_VALUES
 from nerg_mi.errors import NergError
 from nerg_mi.fields.mlp import namespace
+from nerg_mi.files.atomic import file_sha256
 from nerg_mi.formats.fields import load_gaze, save_gaze
 from nerg_mi.tracking.rays import Rays
 from tests.aoi.place import first_box, people, write_place
+from tests.formats.test_boxes import write_twin
 from tests.recorder import Recorder
 from tests.refusals import mentions
 
@@ -166,6 +168,7 @@ def test04_predicted_and_recorded_statistics_and_what_if(folder, tmp_path):
     files = [folder / "scene.xml", folder / "rays.npz"]
     result = statistics(files, folder / "areas.json", progress=recorder, **options)
     files = result.save(tmp_path / "out")
+    assert {"changes.json", "tile.obj"} <= set(result.provenance.inputs)
     # A shape that is an AOI keeps its name in the scene.
     assert result.what_if
     field = table(result.aois, cell="all", source="predicted")
@@ -312,3 +315,16 @@ def test_predictions_of_a_field_of_heads_are_named(folder, tmp_path, kind):
     options = {"observers": [(1, 1.5, 1.6)], "progress": recorder, **FAST}
     statistics([folder / "bare" / "scene.xml", gaze], folder / "areas.json", **options)
     assert any("heads" in text for text in recorder.warnings + recorder.messages) == (kind == "head")
+
+
+def test_all_files_are_recorded_with_their_checksums(folder, tmp_path):
+    write_twin(tmp_path / "twin")
+    (tmp_path / "align.json").write_text(json.dumps(np.eye(4).tolist()))
+    (tmp_path / "cohorts.csv").write_text("person,cohort\nname 0,x\nname 1,y\n")
+    (tmp_path / "validation.csv").write_text("person,accuracy,precision\nname 0,1,0.5\nname 1,1,0.5\n")
+    (tmp_path / "zones.json").write_text(json.dumps({"south": [[0, 0, 0], [6, 2, 0.1]]}))
+    options = {name: tmp_path / f"{name}.csv" for name in ("cohorts", "validation")}
+    options |= {name: tmp_path / f"{name}.json" for name in ("align", "zones")}
+    result = statistics(people(2, 20), tmp_path / "twin", error=TrackerError(draws=2), **options, **FAST)
+    files = [*options.values(), *(tmp_path / "twin").iterdir()]
+    assert result.provenance.inputs == {path.name: file_sha256(path) for path in files}
