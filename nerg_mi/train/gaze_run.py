@@ -410,6 +410,12 @@ def fit_gaze(
         last = refit(targets, first, geometry.box, plan, ns, file, report)
     is_fit_interrupted = first.interrupted or last.interrupted
 
+    def save() -> None:
+        # The state of an interrupted fit is saved already, without this result, as if the fit went on.
+        if not is_fit_interrupted:
+            weights = {} if is_refit else last.weights
+            file.save("refit" if is_refit else "fit", last.trainer, first.to_dict(), weights, force=True)
+
     # Select the prior.
     interrupted = is_fit_interrupted
     if selects_weight and selection is None and not interrupted:
@@ -417,6 +423,7 @@ def fit_gaze(
             selection = evaluate_folds(supervision, geometry, plan, ns, progress.start(fold_cost)).select()
         except KeyboardInterrupt:
             interrupted = True
+            save()
     field = last.trainer.make_field(last.weights)
     if selection is not None:
         selection.apply_prior(field, training.rays, geometry, plan)
@@ -451,13 +458,6 @@ def fit_gaze(
             "history": first.history,
         }
     if write is not None:
-
-        def save() -> None:
-            # The state of an interrupted fit is saved already, without this result, as if the fit went on.
-            if not is_fit_interrupted:
-                weights = {} if is_refit else last.weights
-                file.save("refit" if is_refit else "fit", last.trainer, first.to_dict(), weights, force=True)
-
         with saving_on_failure(state.path, save, is_done=not interrupted):
             write(field, provenance)
     return TrainedGaze(field, provenance)

@@ -18,6 +18,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.gaze_log_density import LogGazeConfig
 from nerg_mi.files.atomic import reserve_output
+from nerg_mi.formats.checkpoint import read_checkpoint
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.interruption import TrainingInterrupted
 from nerg_mi.maths.geometry import Similarity
@@ -32,6 +33,7 @@ from nerg_mi.train.gaze_settings import GazeSettings, ProbeSettings
 from nerg_mi.train.radiance import train_radiance
 from tests.plugins.fields import radiance
 from tests.train.gaze.looks import BOX, RAYS, looking_at
+from tests.train.gaze.test_ensemble import crowd
 
 # ---- The training of a gaze field, also by its command: geometries, recipes, hold-out, resuming, messages ----
 
@@ -250,6 +252,34 @@ def test_an_interrupted_training_stops_the_script_and_reports_how_to_resume(rays
         train_gaze(rays, "none", **options, output=out, resume=True)
 
 
+@pytest.mark.parametrize("zones", [0, 1])
+def test_a_training_interrupted_in_its_folds_resumes_to_the_same_result(tmp_path, single_thread, zones):
+    """After the only fit, or after a refit on all rays."""
+
+    class StopInFold(Listener):
+        def progress(self, share, text=""):
+            super().progress(share, text)
+            if text.startswith("fold 2"):
+                raise KeyboardInterrupt
+
+    rays, out = crowd(), tmp_path / "gaze.safetensors"
+    options = {**QUICK, "validation_zones": zones, "prior_folds": 2, "variant": "capture", "save_every": 0}
+    with pytest.raises(TrainingInterrupted) as end:
+        train_gaze(rays, "none", **options, output=out, progress=StopInFold())
+    assert {p.name for p in tmp_path.iterdir()} == {"gaze.safetensors", "gaze.run"}
+    steps = end.value.provenance["steps"]
+    assert read_checkpoint(tmp_path / "gaze.run", "gaze run")[1]["steps"] == steps > 0
+    assert "mix" not in end.value.provenance
+    resumed = train_gaze(rays, "none", **options, output=out, resume=True)
+    complete = train_gaze(rays, "none", **options)
+    assert [p.name for p in tmp_path.iterdir()] == ["gaze.safetensors"]
+    assert resumed.provenance["mix"] == complete.provenance["mix"] and complete.provenance["mix"]["folds"] == 2
+    assert resumed.provenance.get("validation") == complete.provenance.get("validation")
+    assert complete.provenance["refitted"] == bool(zones)
+    for name, value in arrays(complete.network).items():
+        np.testing.assert_array_equal(value, arrays(resumed.network)[name], err_msg=name)
+
+
 def test_the_command_resumes_a_training(tmp_path, monkeypatch, capsys):
     from nerg_mi.train.gaze_trainer import GazeTrainer
 
@@ -278,8 +308,6 @@ def test_the_command_resumes_a_training(tmp_path, monkeypatch, capsys):
 
 
 def test_an_ensemble_is_one_option(tmp_path):
-    from tests.train.gaze.test_ensemble import crowd
-
     out = tmp_path / "gaze.safetensors"
     options = {**FOLDED, "steps": 2, "validation_zones": 1, "ensemble": 2, "half": True}
     heard = Listener()
