@@ -51,7 +51,7 @@ def list_variants(recipe: Recipe, in_field: bool) -> dict[str, dict]:
         for kind in ("accumulated", "snapshot"):
             out |= {f"semantic {kind}": change({}, semantic=kind)}
             out |= {f"semantic {kind}, own too": change({}, semantic=kind, semantic_own=True)}
-    if in_field and "init" in recipe.supported_options:
+    if in_field and "init_from_field" in recipe.supported_options:
         out |= {"begins as the field, frozen": change({"freeze": True}, init_from_field=True)}
         out |= {"begins as the field": change({}, init_from_field=True)}
     return out

@@ -406,8 +406,8 @@ class AlignmentTarget:
         if self.points is not None:
             return surface_from_points(transform_points(self.to_z_up, self.points))
         raise NergError(
-            f"this evidence needs the geometry of the scene: give {parameter('field', 'FILE')}, "
-            f"{parameter('scene', 'FILE')} or {parameter('surface', 'FILE')} (a mesh or points)"
+            f"this evidence needs the geometry of the scene: give {parameter('environment', 'FILE')} or "
+            f"{parameter('surface', 'FILE')} (a mesh or points)"
         )
 
     @cached_property

@@ -93,7 +93,9 @@ def compute_hit_extent(rays: Rays, voxel: float | None = None, max_voxels: int =
         If the rays have no hit points, or ``voxel`` is too small or not positive.
     """
     if rays.hit is None or not (has_hit := np.isfinite(rays.hit).all(axis=1)).any():
-        raise NergError(f"these rays have no hit points; pass a radiance field with {parameter('field')} instead")
+        raise NergError(
+            f"these rays have no hit points; pass a model of the environment with {parameter('environment')}"
+        )
     if voxel is not None:
         check_number(voxel, LENGTHS, parameter("voxel_size"))
     hits = rays.hit[has_hit]
@@ -210,8 +212,7 @@ def voxelise_hits(rays: Rays, voxel: float | None = None, extent: HitExtent | No
     from scipy.ndimage import binary_closing, binary_dilation
 
     extent = extent or compute_hit_extent(rays, voxel)
-    if rays.hit is None:
-        raise NergError(f"these rays have no hit points; pass a radiance field with {parameter('field')} instead")
+    assert rays.hit is not None  # as checked with the extent
     has_hit = np.isfinite(rays.hit).all(axis=1)
     hits, origins = rays.hit[has_hit], rays.origin[has_hit]
     if extent.is_cut:

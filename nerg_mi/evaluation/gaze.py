@@ -79,8 +79,8 @@ class FieldDensity:
     ):
         if medium is None and field.config.needs_surfaces:
             raise NergError(
-                f"this gaze field was trained with surfaces; pass its geometry with {parameter('field')}, "
-                f"{parameter('scene')} or {parameter('geometry')}"
+                "this gaze field was trained with surfaces; pass the model of its environment with "
+                f"{parameter('environment')}"
             )
         self._gaze, self._environment = (
             GazeFieldInstance(field),

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.fields.kde import Backend, SphericalKde, compute_silverman_kappas, select_loo_kappas
 from nerg_mi.maths import vmf
 from nerg_mi.maths.arrays import check_weights
@@ -246,8 +246,8 @@ def place_probes(
     has_enough = np.diff(neighbours.offsets) >= min_rays
     if not has_enough.any():
         raise NergError(
-            f"none of {len(queries)} probes has {min_rays} rays within {radius} m; increase the radius or reduce "
-            "min_rays"
+            f"none of {len(queries)} probes has {min_rays} rays within {radius} m; increase {parameter('radius')} or "
+            f"reduce {parameter('min_rays')}"
         )
     counts = np.diff(neighbours.offsets)
     is_used, offsets = np.repeat(has_enough, counts), np.concatenate([[0], np.cumsum(counts[has_enough])])

@@ -211,9 +211,11 @@ def train_gaze(
         reaimed_hits=reaimed_hits,
     )
     word = find_word(environment)
-    needs_rays = {"test_zones": test_zones, "align": align is not None, "environment": word == "hits"}
-    needs_rays |= {"prior_folds": prior_folds, "reaimed_hits": reaimed_hits, "semantic": chosen.options.semantic}
-    needs_rays["prior_kappa"] = chosen.probes.prior_kappa is not None
+    keywords = {"test_zones": test_zones, "align": align is not None, "environment": word == "hits"}
+    keywords |= {"prior_folds": prior_folds, "reaimed_hits": reaimed_hits}
+    needs_rays = {parameter(name): is_set for name, is_set in keywords.items()}
+    needs_rays["the option semantic of the recipe"] = chosen.options.semantic
+    needs_rays["the prior_kappa of the recipe"] = chosen.probes.prior_kappa is not None
     _check_data(rays is None, (views, salience, align_views), [name for name, is_set in needs_rays.items() if is_set])
     if test_participants and not test_zones:
         raise NergError(f"{parameter('test_participants')} needs test positions: add {parameter('test_zones')}")
@@ -299,7 +301,10 @@ def check_recipe(recipe: Recipe, kind: str, variant: str = "") -> None:
 
 
 def _check_data(views_only: bool, of_views: tuple[object, object, object], needs_rays: list[str]) -> None:
-    """Raise `NergError` if there is nothing to train on, or a parameter lacks the data that it applies to."""
+    """Raise `NergError` if there is nothing to train on, or a parameter lacks the data that it applies to.
+
+    ``needs_rays`` mentions what was given and applies to rays.
+    """
     views, salience, align_views = of_views
     if views_only and views is None:
         raise NergError(
@@ -308,7 +313,7 @@ def _check_data(views_only: bool, of_views: tuple[object, object, object], needs
         )
     if views_only and needs_rays:
         raise NergError(
-            f"{', '.join(map(parameter, needs_rays))} need rays; give a rays file in addition to {parameter('views')} "
+            f"{', '.join(needs_rays)} need rays; give a rays file in addition to {parameter('views')} "
             f"(to hold out views, remove their images from the folder; to align views, use {parameter('align_views')})"
         )
     if (views is None or salience is None) and not (views is salience is align_views is None):

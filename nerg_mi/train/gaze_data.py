@@ -75,7 +75,7 @@ def compute_semantic_features(
     mi = variant_types()
     medium = geometry.medium
     if not isinstance(medium, FieldMedium):
-        raise NergError(f"semantic features need a radiance field; pass one with {parameter('field')}")
+        raise NergError(f"semantic features need a radiance field; pass one with {parameter('environment')}")
     out = np.empty((len(origins), medium.feature_count), np.float16)
     scene, march = SceneGeometry(medium), default_march_settings(medium)
     with dr.suspend_grad():
@@ -485,8 +485,8 @@ def make_targets_from_probes(
     truth = probes.density(rotated)
     if not truth.any():
         raise NergError(
-            f"{directions:,} directions do not resolve the kernels of the rays; use a smaller {parameter('kappa')} "
-            f"or more {parameter('directions')}"
+            f"{directions:,} directions do not resolve the kernels of the rays; use a recipe with a smaller kappa or "
+            f"more {parameter('directions')}"
         )
     return make_observer_targets(
         geometry.points_to_field(probes.positions),

@@ -236,7 +236,9 @@ def _make_product_config(size: str, activation: str) -> Callable[[FieldOptions],
     return config
 
 
-_PRODUCT_OPTIONS = frozenset({"activation", "size", "normalize", "semantic", "init", "loss", "integral_weight"})
+_PRODUCT_OPTIONS = frozenset(
+    {"activation", "size", "normalized", "semantic", "init_from_field", "loss", "integral_weight"}
+)
 
 register_recipe(
     Recipe(

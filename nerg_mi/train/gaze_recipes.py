@@ -21,6 +21,7 @@ from .gaze_settings import GazeSettings, ProbeSettings
 from .gaze_trainer import GazeTrainer
 
 DEFAULT_RECIPE = "default"  # Recipe that is used if none is named
+_KEYWORDS = ("prior_folds", "reaimed_hits")  # Supported options that are keywords of `train_gaze`
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,8 +90,8 @@ class Recipe:
     options: FieldOptions = FieldOptions()  # Options of the architecture
     # Changes of ``settings`` for training on views only, whose common structure is learned late, after a plateau.
     views_only_settings: Mapping[str, Any] = field(default_factory=lambda: {"patience": 10})
-    # Options that the recipe supports, among "activation", "size", "normalize", "semantic", "init", "loss",
-    # "integral_weight", "prior_folds", "prior_kappa", "reaimed_hits".
+    # Options and settings that the recipe supports, among "activation", "size", "normalized", "semantic",
+    # "init_from_field", "loss", "integral_weight", "prior_folds", "prior_kappa", "reaimed_hits".
     supported_options: frozenset[str] = frozenset()
 
     def override(self, **settings: Any) -> Recipe:
@@ -110,7 +111,7 @@ class Recipe:
 
     def without_rays(self) -> Recipe:
         """Return the recipe for training on salience views only, which do not determine the integral of the density."""
-        normalized = self.options.normalized or "normalize" in self.supported_options
+        normalized = self.options.normalized or "normalized" in self.supported_options
         options = replace(self.options, normalized=normalized)
         return replace(self, options=options, settings=replace(self.settings, **self.views_only_settings))
 
@@ -167,8 +168,8 @@ class Recipe:
             "activation": options.activation,
             "size": options.size,
             "semantic": options.semantic,
-            "init": options.init_from_field,
-            "normalize": options.normalized,
+            "init_from_field": options.init_from_field,
+            "normalized": options.normalized,
             "loss": settings.loss not in self.losses,
             "integral_weight": settings.integral_weight not in (0, GazeSettings.integral_weight),
             "prior_folds": settings.prior_folds,
@@ -189,7 +190,8 @@ class Recipe:
             if alternatives
             else f"leave {'it' if len(unsupported) == 1 else 'them'} out"
         )
-        raise NergError(f"the recipe {self.name} does not support {', '.join(map(parameter, unsupported))}; {remedy}")
+        mentions = [parameter(name) if name in _KEYWORDS else name for name in unsupported]
+        raise NergError(f"the recipe {self.name} does not support {', '.join(mentions)}; {remedy}")
 
 
 def get_default_variants(geometry_kind: str) -> tuple[str, ...]:

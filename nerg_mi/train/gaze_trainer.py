@@ -12,7 +12,7 @@ import drjit as dr
 import numpy as np
 from drjit.opt import AdamW
 
-from nerg_mi.errors import NergError, parameter
+from nerg_mi.errors import NergError
 from nerg_mi.fields.gaze_base import GazeHead
 from nerg_mi.fields.radiance import RadianceNetwork
 from nerg_mi.maths.geometry import AnyBox
@@ -224,14 +224,16 @@ class GazeTrainer(Trainer):
     def init_from_radiance(cls, radiance: RadianceNetwork, config: Any) -> tuple[Any, dict]:
         """Return ``config`` with the sizes of a radiance field, and the arrays of the field to start from."""
         raise NergError(
-            f"a {config.kind} gaze field cannot be initialised from a radiance field; leave out "
-            f"{parameter('init', 'field')}"
+            f"a {config.kind} gaze field cannot be initialised from a radiance field; leave out the option "
+            "init_from_field of the recipe"
         )
 
     @classmethod
     def configure_features(cls, radiance: RadianceNetwork, config: Any) -> Any:
         """Return ``config`` with the number of semantic features of ``radiance``."""
-        raise NergError(f"a {config.kind} gaze field has no semantic features; leave out {parameter('semantic')}")
+        raise NergError(
+            f"a {config.kind} gaze field has no semantic features; leave out the option semantic of the recipe"
+        )
 
     def complete_config(self, config: Any, targets: GazeTargets) -> Any:
         """Return ``config`` with the values that depend on the ``targets``."""

@@ -79,7 +79,7 @@ def test_constraints_hold_near_a_constrained_similarity():
 
 
 def test_missing_geometry_is_refused():
-    with pytest.raises(NergError, check=mentions("field")):
+    with pytest.raises(NergError, check=mentions("environment")):
         _ = AlignmentTarget().surface
 
 

@@ -214,7 +214,7 @@ def test_a_given_voxel_size_is_used(rays_hit_extent):
     for bad in (0.0, -1.0, np.nan, np.inf):
         with pytest.raises(NergError, check=mentions("voxel_size")):
             compute_hit_extent(rays_hit_extent, bad)
-    with pytest.raises(NergError, check=mentions("field")):
+    with pytest.raises(NergError, check=mentions("environment")):
         compute_hit_extent(replace(rays_hit_extent, hit=None))
 
 
@@ -263,7 +263,7 @@ def test_gaps_of_up_to_eight_voxels_are_closed(axis, gap, closed):
 
 
 def test_hit_geometry_needs_hits(rays_hit_geometry):
-    with pytest.raises(NergError, check=mentions("field")):
+    with pytest.raises(NergError, check=mentions("environment")):
         voxelise_hits(replace(rays_hit_geometry, hit=None))
     with pytest.raises(NergError, check=mentions("voxel_size")):
         voxelise_hits(rays_hit_geometry, 1e-3)

@@ -19,6 +19,7 @@ from nerg_mi.tracking.probes import (
     place_queries,
 )
 from nerg_mi.tracking.rays import Rays
+from tests.refusals import mentions
 
 # ---- Measures ----
 
@@ -133,7 +134,7 @@ def test_refusals(rays_measures):
         place_probes(rays_measures, 0.25, placement="hexagons", queries=np.zeros((1, 3)))
     with pytest.raises(ValueError, match="kappa_rule"):
         place_probes(rays_measures, 0.25, kappa_rule="magic")
-    with pytest.raises(ValueError, match="increase the radius"):
+    with pytest.raises(NergError, check=mentions("radius", "min_rays")):
         place_probes(rays_measures, 0.001, count=10)
     with pytest.raises(ValueError, match="min_rays"):
         place_probes(rays_measures, 0.25, max_rays=10, min_rays=20)

@@ -490,7 +490,7 @@ def test_features_are_those_of_a_radiance_field():
     targets = make_observer_targets(positions, directions, np.ones((1, 2)), NOWHERE)
     assert targets.semantic is None and (targets.distance == 2).all() and not targets.misses.any()
     assert targets.positions.dtype == targets.directions.dtype == targets.truth.dtype == np.float32
-    with pytest.raises(NergError, check=mentions("field")):
+    with pytest.raises(NergError, check=mentions("environment")):
         make_observer_targets(
             positions, directions, np.ones((1, 2)), NOWHERE, requirements=TargetRequirements(semantic="snapshot")
         )

@@ -242,8 +242,9 @@ def test_unsupported_options_are_refused(name):
     if name != DEFAULT_RECIPE:
         changed.check()
         return
-    with pytest.raises(NergError, match='does not support semantic, init, loss; use recipe="small"'):
+    with pytest.raises(NergError, match='semantic, init_from_field, loss; use recipe="small"') as error:
         changed.check()
+    assert error.value.parameters == {"recipe": "small"}
 
 
 def test_the_papers_recipe_is_fifty_epochs_at_a_rate_that_falls_from_the_start():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 from dataclasses import fields, replace
 from types import SimpleNamespace
@@ -370,8 +371,8 @@ def change(name, options=None, settings=None, probes=None):
         ({**VIEWS, "environment": "hits"}, "^environment need"),
         ({**VIEWS, "prior_folds": 2}, "^prior_folds need"),
         ({**VIEWS, "test_zones": 1}, "^test_zones need"),
-        ({**VIEWS, "recipe": change("small", {"semantic": "snapshot"})}, "^semantic need"),
-        ({**VIEWS, "recipe": change("default", probes={"prior_kappa": 20.0})}, "^prior_kappa need"),
+        ({**VIEWS, "recipe": change("small", {"semantic": "snapshot"})}, "^the option semantic of the recipe need"),
+        ({**VIEWS, "recipe": change("default", probes={"prior_kappa": 20.0})}, "^the prior_kappa of the recipe need"),
         ({**VIEWS, "rays": RAYS, "salience": None}, "saliency maps, or spectral-residual"),
         ({"align_views": "a.json"}, "saliency maps, or spectral-residual"),
         ({"align": "a.json"}, "align applies to a model"),
@@ -391,8 +392,10 @@ def change(name, options=None, settings=None, probes=None):
     ],
 )
 def test_contradictory_arguments_are_refused(arguments, said):
-    with pytest.raises(NergError, match=said):
+    with pytest.raises(NergError, match=said) as error:
         train_gaze(**{"rays": RAYS, "environment": "hits", **arguments})
+    # Options of a recipe are no keywords.
+    assert set(error.value.parameters) <= set(inspect.signature(train_gaze).parameters)
 
 
 @pytest.mark.parametrize("options", [{"init_from_field": True}, {"semantic": "snapshot"}])
