@@ -19,6 +19,8 @@ from nerg_mi.tracking.rays import Rays, merge_rays
 from nerg_mi.tracking.readers.columns import open_named_table
 
 from .areas import AreaGroup
+from .moving import MovingAreas, place_objects
+from .objects import ObjectPoses
 from .placed import (
     HitAssignment,
     PlacedAreas,
@@ -93,6 +95,8 @@ class Counting:
         Error of the eye tracker.
     validation
         File with the error of each participant (`read_validation`), which replaces ``error``.
+    objects
+        Poses of areas and shapes that move.
     """
 
     rules: VisitRules = VisitRules()
@@ -103,6 +107,7 @@ class Counting:
     fov: float = 120.0
     error: TrackerError = TrackerError()
     validation: Path | None = None
+    objects: ObjectPoses | None = None
 
     @property
     def has_error(self) -> bool:
@@ -150,6 +155,12 @@ class AoiContext:
         targets = SamplePoints.sample(placed.aois, sampling.aoi_samples)
         return VisibilityCache(targets, placed.trace_depth, sampling.cell_size * placed.scale, placed.margin)
 
+    @cached_property
+    def moving(self) -> MovingAreas | None:
+        """The areas as they move; None if nothing moves."""
+        poses = self.counting.objects
+        return None if poses is None else place_objects(self.placed, poses)
+
     @property
     def transition_areas(self) -> list[int]:
         """Indices of the areas between which transitions are counted."""
@@ -190,7 +201,11 @@ class AoiContext:
             hit_depth = np.where(np.isfinite(distance), distance, np.inf)
         hits = []
         tolerance = placed.sampling.tolerance
+        scene = None if self.moving is None else self.moving.at(rays.select(np.arange(len(rays))[rows]))
         for direction in sample_cone(d, tolerance) if tolerance > 0 else [d]:
+            if scene is not None:
+                hits.append(scene.assign_hits(o, direction, hit_depth))
+                continue
             depth = hit_depth if environment.medium is None else environment.trace_depth(o, direction)
             hits.append(assign_hits(placed.aois, o, direction, depth, placed.margin))
         return hits[0] if len(hits) == 1 else merge_directions(hits)
@@ -200,18 +215,18 @@ class AoiContext:
         analysed."""
         if self.visibility_cache is None:
             return None
-        environment = self.placed.environment
+        environment, directions = self.placed.environment, facing_directions(rays)
         out = np.zeros((len(rays), len(self.placed.areas.names)), bool)
         for a in range(0, len(rays), _HIT_BATCH):
             part = slice(a, a + _HIT_BATCH)
             observers = environment.points_to_field(rays.origin[part])
-            point_visibility, cell = self.visibility_cache.get_visibility(observers)
-            visible = self.visibility_cache.visible_in_fov(
-                point_visibility[cell],
-                observers,
-                environment.directions_to_field(facing_directions(rays)[part]),
-                self.counting.fov,
-            )
+            facing, fov = environment.directions_to_field(directions[part]), self.counting.fov
+            if self.moving is None:
+                point_visibility, cell = self.visibility_cache.get_visibility(observers)
+                visible = self.visibility_cache.visible_in_fov(point_visibility[cell], observers, facing, fov)
+            else:
+                scene = self.moving.at(rays.select(np.arange(len(rays))[part]))
+                visible = scene.find_visible(observers, facing, fov)
             for k, indices in enumerate(self.placed.members):
                 out[part, k] = visible[:, list(indices)].any(axis=1)
         return out

@@ -39,13 +39,8 @@ _RAY_BATCH = 1 << 20
 _MIN_COSINE = 0.05  # limits the distance along a grazing ray that corresponds to the tolerance
 
 
-class Aoi(Protocol):
-    """An elementary area of interest in scene coordinates. A named area consists of one or more of these."""
-
-    @property
-    def name(self) -> str:
-        """Name of the area."""
-        ...
+class AoiTarget(Protocol):
+    """What rays hit: an area of interest at rest, or in motion."""
 
     @property
     def is_surface(self) -> bool:
@@ -67,6 +62,15 @@ class Aoi(Protocol):
             ``far`` if the ray starts inside, and ``near`` >= ``far`` if the line misses it. For a surface
             (``is_surface``): ``near`` and ``far`` are both the distance to its first intersection, infinite for a miss.
         """
+        ...
+
+
+class Aoi(AoiTarget, Protocol):
+    """An elementary area of interest in scene coordinates. A named area consists of one or more of these."""
+
+    @property
+    def name(self) -> str:
+        """Name of the area."""
         ...
 
     @property
@@ -314,7 +318,7 @@ class HitAssignment:
 
 
 def assign_hits(
-    aois: Sequence[Aoi],
+    aois: Sequence[AoiTarget],
     o: np.ndarray,
     d: np.ndarray,
     depth: np.ndarray | None,
@@ -355,7 +359,7 @@ def assign_hits(
     return HitAssignment(len(o), tuple(rows), tuple(distance))
 
 
-def _assign_hits_to_solids(aois: Sequence[Aoi], o: np.ndarray, d: np.ndarray, margin: float) -> HitAssignment:
+def _assign_hits_to_solids(aois: Sequence[AoiTarget], o: np.ndarray, d: np.ndarray, margin: float) -> HitAssignment:
     """Assign rays to AOIs without surface depths; AOIs are solids that occlude each other."""
     spans = [aoi.intersect(o, d) for aoi in aois]
     entries = [
@@ -368,6 +372,16 @@ def _assign_hits_to_solids(aois: Sequence[Aoi], o: np.ndarray, d: np.ndarray, ma
         np.flatnonzero(is_entered & (near <= nearest_exit + margin)) for (near, _), is_entered in zip(spans, entries)
     ]
     return HitAssignment(len(o), tuple(rows), tuple(near[r].astype(np.float64) for (near, _), r in zip(spans, rows)))
+
+
+def find_nearest_entry(aois: Sequence[AoiTarget], o: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """Return the distance (N,) at which rays enter the nearest AOI, infinite if there is none."""
+    depth = np.full(len(o), np.inf)
+    for aoi in aois:
+        near, far = aoi.intersect(o, d)
+        is_hit = (near >= 0) & (np.isfinite(near) if aoi.is_surface else near < far)
+        depth = np.where(is_hit, np.minimum(depth, near), depth)
+    return depth
 
 
 def merge_members(hits: HitAssignment, members: Sequence[tuple[int, ...]]) -> HitAssignment:
@@ -498,12 +512,7 @@ class PlacedAreas:
         """Return the distance to the surfaces of the environment or, if they are unknown, to the nearest AOI."""
         if self.environment.medium is not None:
             return self.environment.trace_depth(o, d)
-        depth = np.full(len(o), np.inf)
-        for aoi in self.aois:
-            near, far = aoi.intersect(o, d)
-            is_hit = (near >= 0) & (np.isfinite(near) if aoi.is_surface else near < far)
-            depth = np.where(is_hit, np.minimum(depth, near), depth)
-        return depth
+        return find_nearest_entry(self.aois, o, d)
 
 
 def place_areas(

@@ -15,13 +15,9 @@ class VisitRules(ValidatedDataclass):
 
     GROUP: ClassVar = "Analysis"
 
-    merge_gap: float = setting(
-        0.15,
-        "Longest interruption of a visit in seconds: samples on an AOI form one visit unless the gaze is elsewhere for "
-        "longer.",
-        SECONDS,
-    )
     min_visit: float = setting(0.1, "Shortest visit to an AOI in seconds.", SECONDS)
+    merge_gap: float = range_field(0.15, SECONDS)
+    """Longest interruption of a visit: samples on an AOI form one visit unless the gaze is elsewhere for longer."""
     max_gap: float = range_field(1.0, SECONDS)
     """Longest gap between samples. A sample lasts until the next one; across a longer gap it lasts for the median
     sampling interval."""

@@ -376,17 +376,42 @@ def compute_visibility(targets: SamplePoints, observers: np.ndarray, depth: Dept
 
     A surface up to ``margin`` in front of a point does not occlude it.
     """
-    out = np.zeros((len(observers), len(targets.points)), bool)
-    block_size = max(1, _SIGHT_BATCH // max(len(targets.points), 1))
+    points, normals = targets.points[None], targets.normals[None]
+    return find_visible_points(points, normals, observers, lambda rows, o, d: depth(o, d), margin)
+
+
+def find_visible_points(
+    points: np.ndarray,
+    normals: np.ndarray,
+    observers: np.ndarray,
+    depth: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray],
+    margin: float,
+    facing: np.ndarray | None = None,
+    fov: float = 360.0,
+) -> np.ndarray:
+    """Return which points are visible from E observers, (E, S) bool.
+
+    ``points`` and ``normals`` are those of all observers (1, S, 3), or of each one (E, S, 3). ``depth`` gets the
+    indices of the observers before origins and directions. With directions ``facing`` (E, 3), points outside of a field
+    of view of ``fov`` degrees are not visible. ``margin`` is that of `compute_visibility`.
+    """
+    out = np.zeros((len(observers), points.shape[1]), bool)
+    min_cosine = np.cos(np.radians(min(fov, 360.0) / 2))
+    block_size = max(1, _SIGHT_BATCH // max(points.shape[1], 1))
     for a in range(0, len(observers), block_size):
-        block = observers[a : a + block_size]
-        to_point = targets.points[None] - block[:, None]
+        part = slice(a, a + block_size)
+        of_part = part if len(points) > 1 else slice(None)
+        block, n = observers[part], normals[of_part]
+        to_point = points[of_part] - block[:, None]
         distance = np.linalg.norm(to_point, axis=2)
-        facing_term = np.einsum("esk,sk->es", to_point, targets.normals)
-        is_two_sided = ~np.any(targets.normals != 0, axis=1)
-        e, s = np.nonzero(((facing_term < 0) | is_two_sided) & (distance > 0))
+        facing_term = np.einsum("esk,esk->es", to_point, n)
+        is_two_sided = ~np.any(n != 0, axis=2)
+        is_candidate = ((facing_term < 0) | is_two_sided) & (distance > 0)
+        if facing is not None:
+            is_candidate &= np.einsum("esk,ek->es", to_point, facing[part]) >= min_cosine * distance
+        e, s = np.nonzero(is_candidate)
         if len(e):
-            depth_along = depth(block[e], to_point[e, s] / distance[e, s][:, None])
+            depth_along = depth(a + e, block[e], to_point[e, s] / distance[e, s][:, None])
             out[a + e, s] = depth_along >= distance[e, s] - margin
     return out
 

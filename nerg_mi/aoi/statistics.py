@@ -34,6 +34,8 @@ from .areas import AnyAreas, Areas, to_json_values
 from .changes import open_changes
 from .estimates import MIN_PARTICIPANTS
 from .measured import AoiContext, Counting, TimeWindow, count_block, iter_blocks
+from .moving import check_objects
+from .objects import ObjectPoses
 from .output import StatisticsResult, has_parquet
 from .placed import PlacedAreas, open_placed_areas
 from .power import power_rows
@@ -80,6 +82,7 @@ def statistics(
     validation: FilePath | None = None,
     windows: Mapping[str, Sequence[float]] | None = None,
     zones: FilePath | AnyAreas | None = None,
+    objects: FilePath | ObjectPoses | None = None,
     what_if: FilePath | Mapping[str, Any] | None = None,
     observers: ArrayLike | None = None,
     viewpoints: Annotated[int, Range(1, 100_000)] = 256,
@@ -125,6 +128,9 @@ def statistics(
         separately in it; repeatable.
     zones : Areas, path or mapping, optional
         JSON file of boxes on the floor; attention is reported separately for observers in each box.
+    objects : ObjectPoses or path, optional
+        Table with columns time,object,x,y,z,qw,qx,qy,qz (`nerg_mi.aoi.objects`): poses of shapes and areas that move,
+        in the frame of the rays; without x,y,z an object is absent. Predictions ignore them.
     what_if : path or mapping, optional
         JSON file of changes to shapes and observers; the gaze field predicts their effect.
     observers : array_like of shape (M, 3), optional
@@ -205,8 +211,9 @@ def statistics(
         fov,
         error,
         None if validation is None else to_path(validation),
+        None if objects is None else ObjectPoses.open(objects),
     )
-    files = existing_files(*chosen, *areas.files, what_if, align, cohorts, validation)
+    files = existing_files(*chosen, *areas.files, what_if, align, cohorts, validation, objects)
     files += [] if zone_areas is None else zone_areas.files
     plain = {
         "aois": areas.path or (str(aois) if isinstance(aois, (str, os.PathLike)) else None),
@@ -353,6 +360,10 @@ class _Analysis:
             raise NergError(f"{parameter('what_if')} needs a gaze field; give one, or a scene that has one")
         if power is not None and self.rays is None:
             raise NergError(f"{parameter('power')} needs recorded participants; give rays")
+        if self.counting.objects is not None and self.placed.sampler is not None:
+            self.reporter.message("predictions of the gaze field are those of the environment without motion")
+        if self.counting.objects is not None and self.rays is None:
+            raise NergError(f"{parameter('objects')} are poses at the times of rays; give rays")
         if self.rays is None and self.placed.sampler is None:
             raise NergError("there are no observers: give rays or a gaze field")
 
@@ -388,6 +399,8 @@ class _Analysis:
     def _count(self, rays: Rays | RayDataset, num_viewpoints: int) -> tuple[VisitSums, Viewpoints]:
         context, count = self._make_context(rays), len(rays)
         picker = ViewpointSampler(max(1, count // num_viewpoints))
+        if context.moving is not None:
+            check_objects(context.moving, iter_blocks(rays, self.counting.rules), self.reporter)
         has_gaze = self.placed.sampler is not None
         picks = has_gaze or self.counting.has_error
 

@@ -250,7 +250,7 @@ INPUTS = {
     "scene": {"environment", "photos", "align"},
     "view": {"areas", "align"},
     "render": {"frames"},
-    "stats": {"aois", "align", "zones", "cohorts", "validation", "what_if", "salt"},
+    "stats": {"aois", "align", "zones", "cohorts", "validation", "objects", "what_if", "salt"},
     "draw floor": {"scene"},
     "align": {"environment", "surface", "pairs", "tracking_surface", "tracking_cameras", "scene_cameras", "init"},
     "rays events": {"targets"},
