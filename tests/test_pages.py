@@ -91,7 +91,15 @@ def blocks(*languages: str, page: str = "") -> list[Block]:
 
 
 def test01_no_block_is_left_out():
-    here = {"sh", ("README.md", "python"), ("figures.md", "py"), ("python.md", "py"), ("exchange.md", "py")}
+    here = {
+        "sh",
+        ("moving-objects.md", "text"),
+        ("README.md", "python"),
+        ("figures.md", "py"),
+        ("python.md", "py"),
+        ("exchange.md", "py"),
+    }
+    here |= {("moving-objects.md", language) for language in ("text", "python")}
     here |= {(f"{page}.md", "json") for page in ("viewer", "store", "statistics")}
     here |= {
         (f"{page}.md", "python")
@@ -208,6 +216,21 @@ def test_scenes_are_exported(rgb, tmp_path, monkeypatch):
     (block,) = blocks("py", page="exchange.md")
     run(block.text, block.page, names)
     assert all(Path(name).stat().st_size > 1000 for name in ("day.rrd", "day.usdc"))
+
+
+def test_objects_move(rgb, tmp_path):
+    from nerg_mi.aoi.objects import ObjectPoses
+
+    (table,) = blocks("text", page="moving-objects.md")
+    (tmp_path / "poses.csv").write_text(table.text)
+    assert ObjectPoses.load(tmp_path / "poses.csv").names == ("book", "box")
+    (block,) = blocks("python", page="moving-objects.md")
+    names = run(block.text, block.page)
+    # The box leaves the line of sight when it has moved by half of its edge, after 2.2 of 4 seconds.
+    rows = {row["aoi"]: row["share"] for row in names["numbers"].aois}
+    assert rows["box"] == pytest.approx(0.55, abs=0.03) and rows["box"] + rows["wall"] == pytest.approx(1)
+    assert len(names["on_box"]) == pytest.approx(22, abs=1) and np.allclose(names["on_box"].hit[:, 0], 2.8, atol=1e-3)
+    assert names["baked"].on_surface > 0.9
 
 
 def test08_datasets(tmp_path, monkeypatch):
