@@ -48,7 +48,7 @@ def render_tensor(
     Warns
     -----
     UserWarning
-        Once for each scene that cannot be recorded, with the reason: constant weights, derivatives, a sensor or sampler
+        Once for each scene that cannot be recorded, with the reason: derivatives, a sensor or sampler
         of another kind, or a plugin that Dr.Jit cannot record. Its images are traced.
 
     Examples

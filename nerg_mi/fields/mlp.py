@@ -3,7 +3,9 @@ backend."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from types import ModuleType
 from typing import Any, ClassVar
 
@@ -53,6 +55,32 @@ def is_cuda(ns: ModuleType) -> bool:
 # to three times as long as the products themselves. With literal weights in the kernel the sums stay in registers.
 # Products and their order are the same, so results are bit-identical. The cost is compilation: some seconds for each
 # kernel and each set of weights.
+
+# A recording of ``dr.freeze`` would be replayed with the weights of the first image. Only a recorder that compares the
+# `Constants` of all networks, and traces again when one changed, allows them.
+
+
+class Constants:
+    """Weights of a network as numbers. Other weights are another object."""
+
+    __slots__ = ("layers",)
+
+    def __init__(self, weights: Sequence[Any]):
+        self.layers: list[list[list[float]]] = [w.numpy().tolist() for w in weights]
+
+
+_may_record = ContextVar("may_record", default=False)
+
+
+@contextmanager
+def allow_recorded_constants() -> Iterator[None]:
+    """Evaluate networks with constant weights while ``dr.freeze`` records, too."""
+    token = _may_record.set(True)
+    try:
+        yield
+    finally:
+        _may_record.reset(token)
+
 
 _MAX_INLINE_PRODUCTS = 2048
 """Number of products above which a network becomes a separate function of the kernel: compile time grows more than
@@ -115,7 +143,7 @@ class MLP:
         self.buffer = None  # Packed weights of all layers, which kernels read; attached to ``weights``
         # Whether kernels contain the weights as literals instead (`evaluate_with_constants`), and these as numbers.
         self.has_constant_weights = False
-        self._constants: list[list[list[float]]] | None = None
+        self._constants: Constants | None = None
         for first, second in zip(self.weights, self.weights[1:]):
             if first.shape[0] != second.shape[1]:
                 raise ValueError(
@@ -205,13 +233,14 @@ class MLP:
         # Cooperative vectors do not sum the gradients of a broadcast lane.
         width = max(dr.width(c) for c in x)
         x = [c + dr.zeros(ns.Float, width) if dr.width(c) < width else c for c in x]
-        # Not on CUDA, with layer normalisation, in a recording, or with gradients.
+        # Not on CUDA, with layer normalisation, in recordings of others, or with gradients.
         if self.has_constant_weights and not (
-            half or self.norms is not None or dr.flag(dr.JitFlag.FreezingScope) or dr.grad_enabled(self.weights, x)
+            half
+            or self.norms is not None
+            or (dr.flag(dr.JitFlag.FreezingScope) and not _may_record.get())
+            or dr.grad_enabled(self.weights, x)
         ):
-            if self._constants is None:
-                self._constants = [w.numpy().tolist() for w in self.weights]
-            return evaluate_with_constants(self._constants, x)
+            return evaluate_with_constants(self.get_constants().layers, x)
         if self.norms is not None:
             return self._evaluate_normalized(x, ns, half)
         views: Any = self._views
@@ -222,6 +251,12 @@ class MLP:
                 v = dr.maximum(v, 0)
         out = list(v)
         return [ns.Float(c) for c in out] if half else out
+
+    def get_constants(self) -> Constants:
+        """The weights as numbers. They are read on the first call, which must not be recorded."""
+        if self._constants is None:
+            self._constants = Constants(self.weights)
+        return self._constants
 
     def _evaluate_normalized(self, x: list, ns: ModuleType, half: bool) -> list:
         for i in range(len(self.weights)):
@@ -344,8 +379,8 @@ def set_constant_weights(field: Any, enabled: bool = True) -> None:
     """Evaluate the networks of ``field`` (its ``mlps``; of an ensemble all members') with weights as literals of the
     kernel.
 
-    Applies on CPUs, without gradients, outside of ``dr.freeze`` and without layer normalisation; other evaluations are
-    unchanged. New weights require a new compilation.
+    Applies on CPUs, without gradients, without layer normalisation, and in ``dr.freeze`` only if a `Recorder` calls it;
+    other evaluations are unchanged. New weights require a new compilation.
     """
     for net in field.mlps:
         net.has_constant_weights = enabled

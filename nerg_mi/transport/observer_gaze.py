@@ -622,14 +622,17 @@ class ObservedGaze:
 
 
 def require_listed_networks(field: Any) -> None:
-    """Raise `NotRecordable` unless a recording knows what ``field`` reads: it lists its networks, whose weights are no
-    constants.
+    """Raise `NotRecordable` unless a recording knows what ``field`` reads: it lists its networks.
 
     Registered fields of other packages need not list theirs, and may read what is no attribute.
     """
     networks = getattr(field, "mlps", None)
-    if networks is None or any(net.has_constant_weights for net in networks):
-        raise NotRecordable("constant weights, or networks that a field does not list")
+    if networks is None:
+        raise NotRecordable("networks that a field does not list")
+    for net in networks:
+        if net.has_constant_weights:
+            # They belong to the key of a recording, which cannot read them.
+            net.get_constants()
 
 
 def list_geometry_inputs(geometry: SceneGeometry) -> list[Any]:

@@ -20,6 +20,8 @@ import drjit as dr
 import drjit.nn as nn
 import numpy as np
 
+from nerg_mi.fields.mlp import allow_recorded_constants
+
 from .jit import gc_paused, is_recording
 
 # ---- State ----
@@ -283,7 +285,7 @@ class _Recording:
         current = self._body = _Body()
 
         def run(arrays: list[Any], natives: Sequence[Any]) -> Any:
-            with gc_paused():
+            with gc_paused(), allow_recorded_constants():
                 return current.function()
 
         self._function: Any = dr.freeze(run, limit=_MAX_VARIANTS, warn_after=1 << 30)

@@ -16,6 +16,7 @@ import pytest
 import nerg_mi as nerg
 from nerg_mi.environment import bands
 from nerg_mi.errors import NergError
+from nerg_mi.fields import mlp
 from nerg_mi.fields.gaze_base import RaySupport
 from nerg_mi.fields.gaze_hits import HitKernel, ReaimedHits
 from nerg_mi.formats.fields import save_gaze
@@ -225,6 +226,37 @@ def test02_each_argument_is_noticed(rgb, files, changed):
     vars(subject).update(changed)
     second = subject.record()
     assert first.shape != second.shape or not np.array_equal(first, second)
+
+
+@pytest.mark.parametrize("gaze", ["gaze", "hits"])
+def test07_constant_weights(rgb, files, gaze, count_traces, monkeypatch):
+    """Weights in the kernel belong to the structure; images equal those with variable weights."""
+    subject, rng = Subject(rgb, files, gaze), np.random.default_rng(5)
+    networks = []
+    evaluate = mlp.evaluate_with_constants
+    monkeypatch.setattr(mlp, "evaluate_with_constants", lambda *args: networks.append(0) or evaluate(*args))
+    expected = subject.record()
+    assert not networks
+    scene = nerg.Scene(subject.scene)
+    scene.set_constant_weights()
+    assert np.array_equal(subject.record(), expected) and networks
+    moves = (move_camera, move_observer, change_falloff)
+    for change in moves:
+        change(rgb, subject.scene, rng)
+        subject.record()
+    for change in moves:
+        traced = count_traces()
+        change(rgb, subject.scene, rng)
+        subject.render()
+        # For comparison only.
+        assert count_traces() == traced + 1
+    for _ in range(3):
+        previous = subject.record()
+        while np.array_equal(subject.render(), previous):
+            change_weights(rgb, subject.scene, rng)
+    changed = subject.record()
+    scene.set_constant_weights(False)
+    assert np.array_equal(subject.record(), changed)
 
 
 @pytest.mark.parametrize("gaze", ["gaze", "hits"])
@@ -536,24 +568,6 @@ def test16_observers_of_media(rgb, files, kind, monkeypatch):
 
 
 # ---- What cannot be recorded ----
-
-
-def test11_reason_is_told_once(rgb, files, recwarn):
-    scene = make_scene(rgb, files)
-    nerg.Scene(scene).set_constant_weights()
-    for seed in range(2):
-        image = nerg.render_tensor(scene, seed=seed)
-        assert np.array_equal(image, rgb.render(scene, seed=seed))
-    assert ["constant weights" in str(warning.message) for warning in recwarn] == [True]
-
-
-def test07_scenes_that_cannot_be_recorded_are_traced(rgb, files, count_traces):
-    for is_constant, reason in ((True, "constant weights"), (False, "")):
-        scene = scene_with(rgb, with_field(files, aovs="depth"), camera(rgb, size=6))
-        nerg.Scene(scene).set_constant_weights(is_constant)
-        for _ in range(4):
-            image(scene, scene.sensors()[0], 1, 0)
-        assert reason in scene.integrator().recorder.reason and bool(reason) == (count_traces() == 4)
 
 
 @pytest.mark.parametrize(
