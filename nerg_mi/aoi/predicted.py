@@ -164,7 +164,7 @@ def predict_attention(
         targets,
         viewpoints.positions,
         viewpoints.facing,
-        compute_visibility(targets, viewpoints.positions, placed.environment.trace_depth, placed.margin),
+        compute_visibility(targets, viewpoints.positions, placed.trace_depth, placed.margin),
         fov,
     )
     visible = np.stack([in_fov[:, list(indices)].any(axis=1) for indices in placed.members], axis=1)

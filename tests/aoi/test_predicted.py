@@ -95,6 +95,11 @@ def test_shares_are_integrals():
     np.testing.assert_allclose(in_metres.share, result.share)
 
 
+def test_areas_hide_others_if_there_are_no_surfaces():
+    result = predict(AHEAD, Region.create("hidden", [3, -0.5, -0.5], [4, 0.5, 0.5]))
+    assert result.visible.tolist() == [[True, False]] * 3 and result.share[:, 1].tolist() == [0, 0, 0]
+
+
 def test_prediction_is_aggregated_by_participant():
     result = predict(AHEAD, directions=4096)
     people = aggregate_by_participant(result, OBSERVERS, ALL, {"Ada": 3.0, "Bo": 6.0}, 0.3)
