@@ -135,7 +135,7 @@ def _find_visits(rays: Rays, placed: PlacedAreas, reporter: Reporter) -> BidsEve
     for note in placed.warnings:
         reporter.message(note)
     has_hits = rays.hit is not None and bool(np.isfinite(rays.hit).any())
-    context = AoiContext(placed, Counting(), placed.environment.medium is None and has_hits)
+    context = AoiContext(placed, Counting(), has_hits and not placed.environment.has_surfaces)
     return _join(
         [
             _events(visits.first, visits.start, visits.duration, np.full(len(visits), "visit"), area=name)

@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from nerg_mi.environment.environment import Environment
 from nerg_mi.environment.gaze import GazeField
 from nerg_mi.environment.inputs import Inputs, sort_inputs
 from nerg_mi.environment.scene_loading import activate_mitsuba
@@ -116,7 +117,7 @@ def statistics(
         Aria Digital Twin. Areas in memory are boxes (two corners), meshes of trimesh or dicts as in the file, by name.
     align : path or similarity, optional
         JSON file with the 4x4 similarity from the frame of the rays to that of the scene, as nerg align writes it.
-        Default: the alignment of the gaze field.
+        Default: the alignment of the gaze field, or of an environment in memory.
     cohorts : path, optional
         CSV file with columns person,cohort; attention is reported separately for each cohort. Default: the cohorts in
         the rays.
@@ -194,7 +195,7 @@ def statistics(
     if aois is None:
         raise NergError(f"no AOIs are given; add {parameter('aois', 'FILE')}")
     mode = str(activate_mitsuba().variant())
-    chosen = _open_inputs(inputs)
+    chosen, align = _open_inputs(inputs, align)
     areas = Areas.open(aois, "aois")
     zones = to_json_values(zones) if isinstance(zones, Mapping) else zones
     zone_areas = None if zones is None else Areas.open(zones, "zones")
@@ -293,18 +294,23 @@ def _check_observers(observers: ArrayLike) -> np.ndarray:
 # ---- Inputs ----
 
 
-def _open_inputs(inputs: Any) -> Inputs:
-    """Return the inputs by their roles; a gaze field without an environment brings the one of its training."""
+def _open_inputs(inputs: Any, align: Any) -> tuple[Inputs, Any]:
+    """Return the inputs by their roles, as files where they have one, and ``align`` or that of an environment in
+    memory. A gaze field without a file brings the environment of its training."""
     for item in inputs if isinstance(inputs, (list, tuple)) else [inputs]:
         if isinstance(item, (str, os.PathLike)) and Path(item).suffix.lower() in (".json", ".csv"):
             raise NergError(f'"{item}" is not rays, a scene or a field; AOIs are given with {parameter("aois")}')
-    chosen = sort_inputs(inputs).prefer_files()
+    chosen = sort_inputs(inputs)
     if all(value is None for value in chosen):
         raise NergError("there is no input; give rays, a scene, or a gaze field")
+    environment = chosen.environment
+    if align is None and chosen.gaze is None and isinstance(environment, Environment):
+        align = None if environment.align.is_identity else environment.align
+    chosen = chosen.prefer_files()
     if chosen.environment is None and isinstance(chosen.gaze, GazeField) and chosen.gaze.environment is not None:
         # Its file may be elsewhere than the gaze field.
-        return chosen._replace(environment=chosen.gaze.environment.path)
-    return chosen
+        chosen = chosen._replace(environment=chosen.gaze.environment.path)
+    return chosen, align
 
 
 @contextmanager
@@ -328,8 +334,8 @@ def _open_parts(
 
 @dataclass(frozen=True, eq=False)
 class _Attention:
-    """Attention of participants by cell and source: ``sums`` of recordings and those with added ``error``, and what a
-    gaze field predicts from ``viewpoints``, with the recorded ``times`` of participants."""
+    """Attention of participants by cell and source: ``sums`` of recordings, all sums with those of samples with added
+    ``error``, and what a gaze field predicts from ``viewpoints``, with the recorded ``times`` of participants."""
 
     sums: VisitSums | None
     error: VisitSums | None
@@ -420,8 +426,9 @@ class _Analysis:
         return sums, viewpoints
 
     def _make_context(self, rays: Rays | RayDataset) -> AoiContext:
-        first = next(iter_blocks(rays, self.counting.rules))
-        has_surfaces = self.placed.environment.medium is not None
+        # A dataset may be larger than the memory: its first block decides.
+        first = rays if isinstance(rays, Rays) else next(iter_blocks(rays, self.counting.rules))
+        has_surfaces = self.placed.environment.has_surfaces
         hits = not has_surfaces and first.hit is not None and bool(np.isfinite(first.hit).any())
         if first.tracking in ("head", "mixed"):
             self.reporter.message(f"the rays are {TRACKING[first.tracking]}: numbers are those of heads, not of eyes")

@@ -9,16 +9,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from nerg_mi.aoi import measured
 from nerg_mi.aoi import statistics as module
 from nerg_mi.aoi.settings import AoiSampling, TrackerError, VisitRules
 from nerg_mi.aoi.statistics import statistics
 from nerg_mi.aoi.tables import MAX_COMPARED_VALUES
+from nerg_mi.environment.environment import Environment
 from nerg_mi.errors import NergError
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.files.atomic import file_sha256
 from nerg_mi.formats.fields import load_gaze, save_gaze
+from nerg_mi.maths.geometry import Similarity
 from nerg_mi.tracking.rays import Rays
-from tests.aoi.place import first_box, people, write_place
+from tests.aoi.place import SIGN, first_box, people, write_place
 from tests.formats.test_boxes import write_twin
 from tests.recorder import Recorder
 from tests.refusals import mentions
@@ -328,3 +331,27 @@ def test_all_files_are_recorded_with_their_checksums(folder, tmp_path):
     result = statistics(people(2, 20), tmp_path / "twin", error=TrackerError(draws=2), **options, **FAST)
     files = [*options.values(), *(tmp_path / "twin").iterdir()]
     assert result.provenance.inputs == {path.name: file_sha256(path) for path in files}
+
+
+def test_the_alignment_of_an_environment_in_memory_is_kept(folder):
+    aligned = replace(Environment.open(folder / "bare" / "scene.xml"), align=Similarity(np.diag([2.0, 2, 2, 1])))
+    rays = people(2, 20)
+    halved = replace(rays, origin=rays.origin / 2)
+    result = statistics([aligned, halved], folder / "areas.json", **FAST)
+    expected = statistics([folder / "bare" / "scene.xml", rays], folder / "areas.json", **FAST)
+    assert result.aois[0]["share"] == pytest.approx(expected.aois[0]["share"]) and result.aois[0]["share"] > 0
+    # Parts get it, too.
+    assert result.provenance.settings["align"] == aligned.align.matrix.tolist()
+
+
+def test_all_rays_decide_what_is_reported_of_them(folder, monkeypatch):
+    # A block of each participant.
+    monkeypatch.setattr(measured.iter_blocks, "__defaults__", (10,))
+    rays, recorder = people(2, 20), Recorder()
+    hit = np.where(rays.person[:, None] == 1, rays.origin + 9 * rays.direction, np.nan)
+    tracking = {"tracking": "mixed", "tracking_by_person": {"name 0": "eye", "name 1": "head"}}
+    mixed = replace(rays, hit=hit, metadata=rays.metadata | tracking)
+    statistics(mixed, {"sign": SIGN}, progress=recorder, **FAST)
+    assert any("heads" in text for text in recorder.messages) and any(
+        "hit points" in text for text in recorder.messages
+    )
