@@ -456,7 +456,7 @@ TABLE = (
             ANALYSIS: ("viewpoints", "aoi_visibility", "resamples", "power", "seed"),
             OUTPUT: ("min_participants", "show_names", "salt"),
         },
-        without=("fov", "eye_height"),
+        without=("fov", "eye_height", "floor_height", "grid_step"),
     ),
     Row(
         "report",

@@ -654,7 +654,8 @@ class RayDataset(Summary):
     ) -> Iterator[Rays]:
         """Iterate over the rays that match ``conditions``, in blocks. Skips parts and row groups that cannot match.
 
-        Participants and cohorts of a block are those that occur in it; its metadata only contain the frame.
+        Participants and cohorts of a block are those that occur in it; its metadata only contain the frame
+        and the kind of tracking.
 
         Parameters
         ----------
