@@ -9,14 +9,13 @@ import numpy as np
 
 from nerg_mi.figures.style import INK, as_axes, font_size, label_bar, new_page, text_scale
 
-from .tables import is_underestimate
+from .tables import Row, is_underestimate
 
 MAX_BARS = 40
 """Maximum number of areas; those with the largest shares are drawn."""
 
 _COLORS = {"measured": "#2b6cb0", "predicted": "#d9730d"}
 _GRID = "#dddddd"
-Row = dict[str, Any]
 
 
 def aois_figure(rows: Sequence[Row], title: str = "Attention on AOIs", axes: Any = None) -> np.ndarray:

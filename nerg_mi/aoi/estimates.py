@@ -255,7 +255,7 @@ def _bootstrap_quantile(t: np.ndarray, error: np.ndarray) -> np.ndarray:
 
 
 def _smoothed_quantile(
-    x: np.ndarray, y: np.ndarray, value: np.ndarray, errors: Pair, resamples: int, seed: int
+    x: np.ndarray, y: np.ndarray, value: np.ndarray, errors: tuple[np.ndarray, np.ndarray], resamples: int, seed: int
 ) -> np.ndarray:
     """Return the factor c (K,) from draws whose numerators are multiplied by log-normal noise; NaN without noise.
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.figures.style import Provenance, save
+from nerg_mi.figures import style
 from nerg_mi.files.atomic import make_folder, replace_atomically, write_text
 from nerg_mi.files.dataframes import ResultTables
 from nerg_mi.files.tables import format_markdown_table, write_csv
@@ -61,13 +61,12 @@ def write_rows(
     name
         File name without suffix.
     rows
-        Rows of the table. They are read in batches, since `ParticipantRows` creates rows on access. Without rows, the
-        table has a header only.
+        Rows of the table. They are read in batches, since `ParticipantRows` creates rows on access.
     header, format_row
         Column titles of the Markdown table, and a function that formats one of its rows. At most `MAX_MARKDOWN_ROWS`
         rows are written to Markdown.
     """
-    columns = _column_names(rows) or list(header)
+    columns = _column_names(rows)
     written = [folder / f"{name}.csv", folder / f"{name}.md"]
     write_csv(written[0], rows, columns)
     numeric = [title for title in header if title not in _TEXT_COLUMNS]
@@ -203,9 +202,9 @@ def what_if_columns(rows: Sequence[Row]) -> tuple[list[str], FormatRow]:
     return header, format_row
 
 
-def all_columns(rows: Sequence[Row], names: Sequence[str] = ()) -> tuple[list[str], FormatRow]:
+def all_columns(rows: Sequence[Row]) -> tuple[list[str], FormatRow]:
     """Return the header and the row formatter of a table that shows all keys."""
-    header = _column_names(rows) or list(names)
+    header = _column_names(rows)
 
     def format_row(row: Row) -> list[Any]:
         return ["" if row.get(k) is None else f"{row[k]:.4g}" if isinstance(row[k], float) else row[k] for k in header]
@@ -274,7 +273,7 @@ class StatisticsResult(ResultTables):
     resolution: list[Row] = field(default_factory=list)
     sums: VisitSums | None = None
     num_suppressed: int = 0
-    provenance: Provenance = field(default_factory=lambda: Provenance("nerg stats"))
+    provenance: style.Provenance = field(default_factory=lambda: style.Provenance("nerg stats"))
 
     @property
     def verdict(self) -> str:
@@ -304,7 +303,7 @@ class StatisticsResult(ResultTables):
                 files += write_rows(folder, name, rows, *columns)
         if self.aois:
             first_cell = [r for r in self.aois if r["cell"] == self.aois[0]["cell"]]
-            save(aois_figure(first_cell), folder / "aois.png", self.provenance)
+            style.save(aois_figure(first_cell), folder / "aois.png", self.provenance)
             files.append(folder / "aois.png")
         if self.sums is not None and self.transitions:
             counts = {
@@ -315,7 +314,7 @@ class StatisticsResult(ResultTables):
             names = [n for n in self.sums.areas if any(n in pair for pair in counts)]
             if 1 < len(names) <= MAX_MATRIX_AREAS:
                 matrix = np.array([[counts.get((a, b), 0) for b in names] for a in names], float)
-                save(transitions_figure(names, matrix), folder / "transitions.png", self.provenance)
+                style.save(transitions_figure(names, matrix), folder / "transitions.png", self.provenance)
                 files.append(folder / "transitions.png")
         write_text(folder / "about.json", self.provenance.json() + "\n")
         files.append(folder / "about.json")

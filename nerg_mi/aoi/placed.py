@@ -301,7 +301,7 @@ def _make_part_mesh(part: MeshPart, mesh: MeshFile) -> Any:
 # ``near`` <= depth + margin. Without surface depths, AOIs are treated as solids: an AOI occludes another one that the
 # ray enters after it has left the first; AOIs that overlap along the ray are both hit.
 
-MARGIN = 0.03  # default margin in metres, about the accuracy of surfaces in a radiance field
+MARGIN = AoiSampling().margin  # in metres, about the accuracy of surfaces in a radiance field
 
 
 @dataclass(frozen=True)

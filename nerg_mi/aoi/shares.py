@@ -110,7 +110,7 @@ def gaze_shares(
     members
         Indices into ``aois`` of each area.
     margin
-        Tolerance in scene units, as for `visits.assign_hits`.
+        Tolerance in scene units, as for `placed.assign_hits`.
     rule
         Accuracy of the integrals.
     on_progress
@@ -349,7 +349,6 @@ class _ObserverBatch:
 DepthQuery = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Maps origins and unit directions (N, 3) to the distance of the first surface (N,), infinite if there is none."""
 
-POINTS_PER_AOI = 48  # number of sample points of an AOI
 _SIGHT_BATCH = 1 << 20
 
 
@@ -363,7 +362,7 @@ class SamplePoints:
     num_aois: int
 
     @classmethod
-    def sample(cls, aois: Sequence[Aoi], num_points: int = POINTS_PER_AOI) -> SamplePoints:
+    def sample(cls, aois: Sequence[Aoi], num_points: int) -> SamplePoints:
         samples_of_aois = [thing.sample_points(num_points) for thing in aois]
         index = np.repeat(np.arange(len(aois)), [len(points) for points, _ in samples_of_aois])
         empty = np.zeros((0, 3))
@@ -419,7 +418,10 @@ def find_visible_points(
 def visible_in_fov(
     targets: SamplePoints, observers: np.ndarray, facing: np.ndarray, is_visible: np.ndarray, fov: float
 ) -> np.ndarray:
-    """Apply `visible_in_fov` to the sample points of this cache."""
+    """Return which AOIs have a visible point in the field of view of each observer, (E, K) bool.
+
+    ``is_visible`` are the points (E, S) that are visible in any direction.
+    """
     out = np.zeros((len(observers), targets.num_aois), bool)
     min_cosine = np.cos(np.radians(min(fov, 360.0) / 2))
     starts = (
@@ -452,7 +454,6 @@ class VisibilityCache:
         check_number(cell_size, LENGTHS, parameter("cell_size"))
         self._targets, self._depth, self._cell, self._margin = targets, depth, cell_size, margin
         self._visibility: dict[tuple[int, int, int], np.ndarray] = {}
-        self.num_traced = 0
 
     def visible_in_fov(
         self, is_visible: np.ndarray, observers: np.ndarray, facing: np.ndarray, fov: float
@@ -473,7 +474,6 @@ class VisibilityCache:
             visibility = compute_visibility(
                 self._targets, (cells[missing] + 0.5) * self._cell, self._depth, self._margin
             )
-            self.num_traced += len(missing)
             for k, row in zip(missing, visibility):
                 self._visibility[keys[k]] = np.packbits(row)
         bits = np.stack([self._visibility[key] for key in keys])

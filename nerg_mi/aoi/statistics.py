@@ -495,12 +495,11 @@ class _Analysis:
         if attention.predicted is not None:
             duration = self.placed.sampling.glance_duration
             add_uncertainty(rows, attention.predicted, attention.viewpoints, attention.times, duration)
-        source = MEASURED if sums is not None else PREDICTED
         power_table = []
         if power is not None:
             self.reporter.progress(0.95, "power of differences")
             power_table = power_rows(names, people, floor, power, seed=seed)
-        differences = difference_rows(names, people, floor, source=source, resamples=self.resamples, seed=seed)
+        differences = difference_rows(names, people, floor, resamples=self.resamples, seed=seed)
         result = StatisticsResult(aois=rows, differences=differences, power=power_table, sums=sums)
         if sums is None:
             return result

@@ -14,6 +14,7 @@ from nerg_mi.files.tables import join_reasons
 from .estimates import (
     MIN_PARTICIPANTS,
     Estimates,
+    Pair,
     adjust_p_values,
     estimate_proportion_differences,
     estimate_proportions,
@@ -100,9 +101,6 @@ class Participants:
     def ones(self) -> np.ndarray:
         """Ones (P, A) for participants in the cell, zeros for others."""
         return np.repeat(self.is_in_cell[:, None], self.dwell_time.shape[1], axis=1).astype(float)
-
-
-Pair = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -392,21 +390,22 @@ def difference_rows(
     cells: Mapping[Cell, Mapping[str, Participants]],
     min_participants: MinParticipantsFilter,
     *,
-    source: str = MEASURED,
     resamples: int,
     seed: int,
     measures: Sequence[str] = COMPARED_MEASURES,
 ) -> list[Row]:
-    """Return differences between every two values of a dimension, for each area and measure.
+    """Return measured differences between every two values of a dimension, for each area and measure.
 
     p-values are adjusted over all rows (``p_adjusted``); ``significant`` is true for an adjusted value of at most 0.05.
     """
     rows: list[Row] = []
     dimensions = dict.fromkeys(cell.dimension for cell in cells)
     for dimension in dimensions:
-        values = [cell for cell in cells if cell.dimension == dimension and source in cells[cell]][:MAX_COMPARED_VALUES]
+        values = [cell for cell in cells if cell.dimension == dimension and MEASURED in cells[cell]][
+            :MAX_COMPARED_VALUES
+        ]
         for first, second in combinations(values, 2):
-            a, b = cells[first][source], cells[second][source]
+            a, b = cells[first][MEASURED], cells[second][MEASURED]
             if not a.names or not b.names:
                 continue
             names = sorted({*a.names, *b.names})

@@ -8,7 +8,6 @@ import pytest
 import nerg_mi as nerg
 from nerg_mi.aoi.attention import compute_box_shares
 from nerg_mi.aoi.placed import MARGIN, BoxAoi
-from nerg_mi.aoi.settings import AoiSampling
 from nerg_mi.aoi.shares import COARSE, gaze_shares
 from nerg_mi.aoi.statistics import statistics
 from nerg_mi.environment.environment import Environment
@@ -268,7 +267,6 @@ def test14_statistics_viewer_and_report_agree(room):
     position = nerg.attention(scene, SIGN, eye)
     table = statistics(path, path.parent / "areas.json", observers=[EYE], resamples=199).aois
     messages = {row["aoi"]: row["share"] for row in table}
-    assert AoiSampling().margin == MARGIN
     assert messages["the sign"] == pytest.approx(position.share[0], rel=0.03)
     assert messages["the stand"] == pytest.approx(nerg.attention(scene, "stand", eye).share[0], rel=0.03)
     *_, viewer = iter_attention_shares(scene, eye, regions, [])

@@ -53,7 +53,7 @@ ROWS = [
 
 
 def test_rows_are_written_in_all_formats(tmp_path):
-    files = output.write_rows(tmp_path, "t", ROWS, *output.all_columns(ROWS, ()))
+    files = output.write_rows(tmp_path, "t", ROWS, *output.all_columns(ROWS))
     with files[0].open() as file:
         rows = list(csv.DictReader(file))
     assert rows[0]["x"] == "0.125" and rows[1]["n"] == "" and rows[0]["aoi"] == "a|b"
@@ -64,7 +64,7 @@ def test_rows_are_written_in_all_formats(tmp_path):
 
 def test_parquet_is_skipped_without_pyarrow(tmp_path, monkeypatch):
     monkeypatch.setattr(output, "find_spec", lambda name: None)
-    files = output.write_rows(tmp_path, "t", ROWS, *output.all_columns(ROWS, ()))
+    files = output.write_rows(tmp_path, "t", ROWS, *output.all_columns(ROWS))
     assert [f.suffix for f in files] == [".csv", ".md"]
 
 
