@@ -282,20 +282,15 @@ def sum_visits(
     """
     timeline = make_timeline(rays.person, rays.t, rules)
     masks = [mask for _, mask in cells]
-    keys, starts = [], []
-    present = []
-    for (cell, _), mask in zip(cells, masks):
+    keys: list[tuple[Cell, str]] = []
+    tables = []  # for each cell, the row of each participant, or -1
+    for cell, mask in cells:
         codes = np.unique(timeline.person if mask is None else timeline.person[mask])
-        starts.append(len(keys))
-        present.append(codes)
+        table = np.full(len(rays.persons), -1, np.int64)
+        table[codes] = len(keys) + np.arange(len(codes))
+        tables.append(table)
         keys += [(cell, rays.persons[code]) for code in codes]
     out = VisitSums.empty(areas, [cell for cell, _ in cells], keys)
-    # For each cell, the row of each participant, or -1.
-    tables = []
-    for codes, start in zip(present, starts):
-        table = np.full(len(rays.persons), -1, np.int64)
-        table[codes] = start + np.arange(len(codes))
-        tables.append(table)
     session_starts = [_add_rows(out, timeline, mask, table) for mask, table in zip(masks, tables)]
     visits_of_areas = []
     for a, (hit_rows, hit_distance) in enumerate(zip(hits.rows, hits.distance)):
