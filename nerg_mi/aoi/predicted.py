@@ -16,7 +16,7 @@ from nerg_mi.tracking.rays import Rays
 
 from .areas import Areas
 from .changes import Changes, apply_changes
-from .estimates import adjust_p_values, estimate_ratio_differences
+from .estimates import estimate_ratio_differences
 from .measured import AoiContext, facing_directions
 from .placed import PlacedAreas
 from .settings import ObserverGrid
@@ -28,6 +28,7 @@ from .tables import (
     MinParticipantsFilter,
     Participants,
     Row,
+    add_adjusted_p,
     explain_difference,
 )
 from .visits import ALL, Cell
@@ -422,9 +423,7 @@ def what_if_rows(
                 reasons["no difference" if row["difference"] is None else reason] = ["difference_spread"]
             row["note"] = "; ".join(filter(None, (after.note, row["note"], join_reasons(reasons))))
             rows.append(row | {"support": support, "source": PREDICTED})
-    adjusted_p = adjust_p_values(np.array([np.nan if row["p"] is None else row["p"] for row in rows], float))
-    for row, p in zip(rows, adjusted_p):
-        row["p_adjusted"] = float(p) if np.isfinite(p) else None
+    add_adjusted_p(rows)
     return rows
 
 

@@ -330,37 +330,38 @@ def aoi_rows(
     """
     rows: list[Row] = []
     for cell, sources in cells.items():
-        rows_of_source: dict[str, list[Row]] = {}
-        for source, participants in sources.items():
-            estimates = {m.name: m.estimate(participants, resamples, seed) for m in MEASURES}
-            count = int(participants.is_in_cell.sum())
-            rows_of_source[source] = []
-            for a, area in enumerate(areas):
+        estimates = {s: [(m, m.estimate(people, resamples, seed)) for m in MEASURES] for s, people in sources.items()}
+        for a, area in enumerate(areas):
+            for source, people in sources.items():
                 row: Row = {"cell": cell.dimension, "value": cell.value, "aoi": area, "source": source}
+                count = int(people.is_in_cell.sum())
                 row["participants"] = count if min_participants.allows(count) else None
                 reasons: dict[str, list[str]] = {}
-                for name, estimate in estimates.items():
-                    is_allowed = estimate is not None and min_participants.allows(int(estimate.participants[a]))
-                    for key in ("", "_low", "_high"):
-                        row[name + key] = (
-                            _finite_or_none(getattr(estimate, key[1:] or "value")[a]) if is_allowed else None
-                        )
-                    row[name + "_participants"] = (
-                        int(estimate.participants[a]) if estimate is not None and is_allowed else None
-                    )
-                    if estimate is None:
-                        reason = _NOT_COMPUTED if MEASURES_BY_NAME[name].needs_visibility else _NOT_PREDICTED
-                    elif not is_allowed:
-                        reason = min_participants.reason
-                    elif row[name] is None:
-                        reason = f"no {MEASURES_BY_NAME[name].population}"
-                    else:
-                        reason = NO_INTERVAL if row[name + "_low"] is None or row[name + "_high"] is None else ""
-                    reasons.setdefault(reason, []).append(name)
+                for measure, estimate in estimates[source]:
+                    reason = _add_estimate(row, measure, estimate, a, min_participants)
+                    reasons.setdefault(reason, []).append(measure.name)
                 row["note"] = join_reasons(reasons)
-                rows_of_source[source].append(row)
-        rows += [rows_of_source[source][a] for a in range(len(areas)) for source in sources]
+                rows.append(row)
     return rows
+
+
+def _add_estimate(
+    row: Row, measure: Measure, estimate: Estimates | None, a: int, min_participants: MinParticipantsFilter
+) -> str:
+    """Add the estimate of a measure for the area ``a`` to ``row``. Return why it has no value or interval; "" if it
+    has both."""
+    keys = [measure.name + key for key in ("", "_low", "_high", "_participants")]
+    row |= dict.fromkeys(keys)
+    if estimate is None:
+        return _NOT_COMPUTED if measure.needs_visibility else _NOT_PREDICTED
+    count = int(estimate.participants[a])
+    if not min_participants.allows(count):
+        return min_participants.reason
+    value, low, high = (_finite_or_none(v[a]) for v in (estimate.value, estimate.low, estimate.high))
+    row |= zip(keys, (value, low, high, count))
+    if value is None:
+        return f"no {measure.population}"
+    return NO_INTERVAL if low is None or high is None else ""
 
 
 _NOT_COMPUTED, _NOT_PREDICTED = "visibility is not computed", "a gaze field has no time course"
@@ -414,11 +415,17 @@ def difference_rows(
                 rows += _measure_differences(
                     areas, dimension, (first.value, second.value), measure, pair, min_participants, resamples, seed
                 )
+    add_adjusted_p(rows)
+    for row in rows:
+        row["significant"] = row["p_adjusted"] is not None and row["p_adjusted"] <= 0.05
+    return rows
+
+
+def add_adjusted_p(rows: Sequence[Row]) -> None:
+    """Add the p-values, adjusted over all ``rows``, as ``p_adjusted``; None for rows without one."""
     adjusted_p = adjust_p_values(np.array([np.nan if row["p"] is None else row["p"] for row in rows], float))
     for row, p in zip(rows, adjusted_p):
         row["p_adjusted"] = _finite_or_none(p)
-        row["significant"] = bool(p <= 0.05)
-    return rows
 
 
 def _measure_differences(
