@@ -206,7 +206,7 @@ class AoiContext:
             if scene is not None:
                 hits.append(scene.assign_hits(o, direction, hit_depth))
                 continue
-            depth = hit_depth if environment.medium is None else environment.trace_depth(o, direction)
+            depth = environment.trace_depth(o, direction) if environment.has_surfaces else hit_depth
             hits.append(assign_hits(placed.aois, o, direction, depth, placed.margin))
         return hits[0] if len(hits) == 1 else merge_directions(hits)
 
@@ -222,8 +222,7 @@ class AoiContext:
             observers = environment.points_to_field(rays.origin[part])
             facing, fov = environment.directions_to_field(directions[part]), self.counting.fov
             if self.moving is None:
-                point_visibility, cell = self.visibility_cache.get_visibility(observers)
-                visible = self.visibility_cache.visible_in_fov(point_visibility[cell], observers, facing, fov)
+                visible = self.visibility_cache.visible_in_fov(observers, facing, fov)
             else:
                 scene = self.moving.at(rays.select(np.arange(len(rays))[part]))
                 visible = scene.find_visible(observers, facing, fov)

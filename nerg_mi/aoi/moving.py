@@ -143,7 +143,7 @@ class AreasAtTimes:
             limits[0] += self.moving.occlusion_margin
             limits[owner + 1] = np.inf
             aois.append(_AoiAtTimes(aoi, self.motions[owner] if owner >= 0 else None, limits.min(axis=0)))
-        is_known = self.moving.placed.environment.medium is not None
+        is_known = self.moving.placed.environment.has_surfaces
         return aois, depths.min(axis=0) if is_known else hit_depth
 
     def assign_hits(self, o: np.ndarray, d: np.ndarray, hit_depth: np.ndarray | None = None) -> HitAssignment:

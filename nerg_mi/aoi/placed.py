@@ -510,7 +510,7 @@ class PlacedAreas:
 
     def trace_depth(self, o: np.ndarray, d: np.ndarray) -> np.ndarray:
         """Return the distance to the surfaces of the environment or, if they are unknown, to the nearest AOI."""
-        if self.environment.medium is not None:
+        if self.environment.has_surfaces:
             return self.environment.trace_depth(o, d)
         return find_nearest_entry(self.aois, o, d)
 

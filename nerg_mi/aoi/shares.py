@@ -455,11 +455,10 @@ class VisibilityCache:
         self._targets, self._depth, self._cell, self._margin = targets, depth, cell_size, margin
         self._visibility: dict[tuple[int, int, int], np.ndarray] = {}
 
-    def visible_in_fov(
-        self, is_visible: np.ndarray, observers: np.ndarray, facing: np.ndarray, fov: float
-    ) -> np.ndarray:
-        """Apply `visible_in_fov` to the sample points of this cache."""
-        return visible_in_fov(self._targets, observers, facing, is_visible, fov)
+    def visible_in_fov(self, observers: np.ndarray, facing: np.ndarray, fov: float) -> np.ndarray:
+        """Return which AOIs are visible to each of N observers who face ``facing`` (N, 3), (N, K) bool."""
+        is_visible, cell = self.get_visibility(observers)
+        return visible_in_fov(self._targets, observers, facing, is_visible[cell], fov)
 
     def get_visibility(self, observers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the visibility of the sample points in C cells (C, S), and the cell index of each of N observers
