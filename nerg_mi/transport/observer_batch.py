@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import numpy as np
@@ -24,7 +24,7 @@ from .observer_gaze import (
     ObserverTracer,
     first_direction_count,
     next_direction_count,
-    sum_sphere,
+    sum_spheres,
 )
 
 # `GazeFieldInstance.for_observers` serves few observers and many directions: each observer has its own launches and its
@@ -34,6 +34,11 @@ from .observer_gaze import (
 
 RAYS_PER_LAUNCH = 1 << 18
 """Rays per kernel launch."""
+
+# An integral over the sphere averages over the errors of single depths. If its tolerance is at least _COARSE_TOLERANCE,
+# its rays are therefore marched in longer steps, to a transmittance that hardly moves the median. In the demo store
+# this halves the time and changes integrals by .1 % (root mean square).
+_COARSE_STEP, _COARSE_STOP, _COARSE_TOLERANCE = 3.0, 0.05, 0.01
 
 _OBSERVERS_PER_BLOCK = 256
 """Observers whose depths for escaped rays are held at the same time, 32 KiB each."""
@@ -109,6 +114,7 @@ class _Block:
     ):
         mi = variant_types()
         self._instance, self._geometry, self._settings = instance, geometry, settings
+        self._sphere_settings = _coarsen(settings, geometry)
         self._positions, self._count = to_vector(mi.Point3f, positions), len(positions)
         self._miss_depths: list[MissDepths] = []
         if instance.field.config.needs_surfaces and instance.field.config.fills_escaped:
@@ -126,9 +132,8 @@ class _Block:
         for start in range(0, len(observer), RAYS_PER_LAUNCH):
             rows = slice(start, start + RAYS_PER_LAUNCH)
             index = observer[rows]
-            lanes = self._trace(
-                mi.UInt32(copy_aligned(index, np.uint32)), to_vector(mi.Vector3f, directions[rows]), index
-            )
+            tracer = self._tracer(mi.UInt32(copy_aligned(index, np.uint32)), self._settings)
+            lanes = self._trace(tracer, to_vector(mi.Vector3f, directions[rows]), index)
             values = [self._evaluate_member(k, lanes, index) for k in range(len(self._instance.field.members))]
             dr.eval(values)
             parts.append(np.stack([np.array(value) for value in values]))
@@ -173,10 +178,9 @@ class _Block:
             observers = np.flatnonzero(unfinished.any(axis=0))
             for index, values in self._integrands(observers, count):
                 for number in range(len(members)):
-                    for observer, integrand in zip(index, values[number]):
+                    for observer, integral in zip(index, sum_spheres(values[number])):
                         if not unfinished[number, observer]:
                             continue
-                        integral = sum_sphere(integrand)
                         integrals[number, observer] = integral.value
                         if count < settings.directions and integral.error > settings.integral_tolerance:
                             larger = next_direction_count(integral, settings.directions, settings.integral_tolerance)
@@ -190,7 +194,8 @@ class _Block:
         order = morton_order(count)
         for index, observer, direction in _launches(observers, count):
             directions = fibonacci_directions_jit(count, dr.gather(mi.UInt32, mi.UInt32(order), direction))
-            lanes = self._trace(observer, directions, np.repeat(index, count) if self._miss_depths else None)
+            tracer = self._tracer(observer, self._sphere_settings)
+            lanes = self._trace(tracer, directions, np.repeat(index, count) if self._miss_depths else None)
             values = []
             for member in members:
                 emit, capture = self._instance.unnormalized(
@@ -203,10 +208,9 @@ class _Block:
                 row[:, order] = np.array(value).reshape(len(index), count)
             yield index, integrand
 
-    def _trace(self, observer, directions: Vector3f, index: np.ndarray | None) -> _Lanes:
-        """Trace the rays of the observers with indices ``observer`` (UInt32); ``index``: the same in NumPy, sorted, if
-        escaped rays take the depths of their neighbours."""
-        tracer = self._tracer(observer)
+    def _trace(self, tracer: ObserverTracer, directions: Vector3f, index: np.ndarray | None) -> _Lanes:
+        """Trace rays; ``index``: those of their observers, sorted, if escaped rays take the depths of their
+        neighbours."""
         dr.eval(directions)
         if not self._miss_depths:
             distance, escaped = tracer.trace_distances(directions)
@@ -226,18 +230,32 @@ class _Block:
     def _trace_miss_depths(self) -> Iterator[MissDepths]:
         vectors = np.array(fibonacci_directions_jit(MISS_DIRECTIONS)).T
         for index, observer, direction in _launches(np.arange(self._count), MISS_DIRECTIONS):
-            directions, tracer = fibonacci_directions_jit(MISS_DIRECTIONS, direction), self._tracer(observer)
+            directions = fibonacci_directions_jit(MISS_DIRECTIONS, direction)
+            tracer = self._tracer(observer, self._sphere_settings)
             has_surface, distance = tracer.trace_surfaces(directions, ends_at_box=True)
             dr.eval(has_surface, distance)
             shape = len(index), MISS_DIRECTIONS
             for mask, depth in zip(np.array(has_surface).reshape(shape), np.array(distance).reshape(shape)):
                 yield MissDepths(vectors[mask], depth[mask])
 
-    def _tracer(self, observer) -> ObserverTracer:
-        """A tracer of the rays of the observers with indices ``observer`` (UInt32)."""
+    def _tracer(self, observer: UInt32, settings: ObserverSettings) -> ObserverTracer:
+        """A tracer of the rays of the observers with indices ``observer``."""
         center = dr.gather(variant_types().Point3f, self._positions, observer)
         dr.eval(center)
-        return ObserverTracer(self._instance, self._geometry, center, self._settings)
+        return ObserverTracer(self._instance, self._geometry, center, settings)
+
+
+def _coarsen(settings: ObserverSettings, geometry: SceneGeometry) -> ObserverSettings:
+    """Return the settings of the rays of an integral over the sphere to ``settings.integral_tolerance``."""
+    if geometry.medium is None or settings.integral_tolerance < _COARSE_TOLERANCE:
+        return settings
+    march = settings.march
+    # A longer step could pass over the voxels of a grid.
+    factor = 1.0 if geometry.medium.cells is not None else _COARSE_STEP
+    coarse = replace(
+        march, step=factor * march.step, dt_gamma=factor * march.dt_gamma, stop=max(march.stop, _COARSE_STOP)
+    )
+    return replace(settings, march=coarse)
 
 
 def _launches(observers: np.ndarray, count: int) -> Iterator[tuple[np.ndarray, UInt32, UInt32]]:

@@ -42,7 +42,7 @@ FIRST_DIRECTIONS = 1 << 13
 """Directions of the first attempt for a tolerance of `USUAL_TOLERANCE`, usually sufficient; fewer for a larger
 tolerance, at least `MIN_DIRECTIONS`."""
 
-USUAL_TOLERANCE, MIN_DIRECTIONS = 5e-3, 1 << 11
+USUAL_TOLERANCE, MIN_DIRECTIONS = 5e-3, 1 << 10
 ERROR_PARTS = 8
 """Partial sums whose scatter estimates the error. Every eighth point of a golden spiral lies on a spiral of eight times
 the angle, which is less even, and the errors of the parts are often of opposite sign; the error is therefore
@@ -85,7 +85,7 @@ def integrate_sphere(values: Callable[[int], np.ndarray], max_directions: int, t
 def first_direction_count(max_directions: int, tolerance: float) -> int:
     """Directions of the first attempt of `integrate_sphere`."""
     count = (
-        FIRST_DIRECTIONS >> max(0, math.floor(math.log2(tolerance / USUAL_TOLERANCE) / ERROR_EXPONENT))
+        FIRST_DIRECTIONS >> max(0, round(math.log2(tolerance / USUAL_TOLERANCE) / ERROR_EXPONENT))
         if tolerance > 0
         else max_directions
     )
@@ -101,12 +101,21 @@ def next_direction_count(integral: SphereIntegral, max_directions: int, toleranc
 
 def sum_sphere(values: np.ndarray) -> SphereIntegral:
     """The integral of ``values`` (N,) in N directions of equal area, in the order of the spiral."""
-    values = np.asarray(values, np.float64)
-    mean = float(values.mean())
-    parts = [values[k::ERROR_PARTS].mean() for k in range(min(ERROR_PARTS, len(values)))]
-    scatter = float(np.std(parts, ddof=1)) if len(parts) > 1 else math.inf
-    error = scatter * ERROR_PARTS**-ERROR_EXPONENT / abs(mean) if mean else math.inf if scatter else 0.0
-    return SphereIntegral(4 * math.pi * mean, len(values), error)
+    return sum_spheres(np.asarray(values)[None])[0]
+
+
+def sum_spheres(values: np.ndarray) -> list[SphereIntegral]:
+    """The integrals of M functions, each with its ``values`` (M, N) as for `sum_sphere`."""
+    count = values.shape[1]
+    parts = [values[:, k::ERROR_PARTS].mean(axis=1, dtype=np.float64) for k in range(min(ERROR_PARTS, count))]
+    sizes = [len(range(k, count, ERROR_PARTS)) for k in range(len(parts))]
+    means = np.average(parts, axis=0, weights=sizes)
+    scatters = np.std(parts, axis=0, ddof=1) if len(parts) > 1 else np.full(len(values), math.inf)
+    integrals = []
+    for mean, scatter in zip(means.tolist(), scatters.tolist()):
+        error = scatter * ERROR_PARTS**-ERROR_EXPONENT / abs(mean) if mean else math.inf if scatter else 0.0
+        integrals.append(SphereIntegral(4 * math.pi * mean, count, error))
+    return integrals
 
 
 # ---- Sphere samples ----

@@ -14,11 +14,12 @@ from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
 from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.transport import observer_batch
-from nerg_mi.transport.geometry import SceneGeometry
+from nerg_mi.transport.geometry import SceneGeometry, default_march_settings
 from nerg_mi.transport.march_primal import MarchSettings
 from nerg_mi.transport.observer import ObserverSettings
 from nerg_mi.transport.observer_batch import evaluate_densities
 from nerg_mi.transport.observer_gaze import GazeFieldInstance
+from nerg_mi.transport.volume_medium import VolumeMedium
 from tests.evaluation.gaze_fields import GRID, KINDS, made
 from tests.plugins import fields
 
@@ -137,3 +138,30 @@ def test_semantic_features_are_those_of_each_observer(rgb, tmp_path, semantic):
     instance, (o, d) = GazeFieldInstance(made("linear", BOX, semantic=semantic)), rays(12)
     result = evaluate_densities(instance, geometry, SETTINGS, o, d)
     np.testing.assert_allclose(result, one_by_one(rgb, instance, geometry, SETTINGS, o, d), rtol=1e-4)
+
+
+def test_rough_integrals_march_in_longer_steps(rgb, tmp_path):
+    fields.radiance(tmp_path / "field.safetensors", density_scale=30.0)
+    geometry = SceneGeometry(Environment.open(tmp_path / "field.safetensors").medium)
+    instance, (o, d) = GazeFieldInstance(made("default recipe", BOX)), rays(12)
+    settings = replace(SETTINGS, integral_tolerance=0.02)
+    result = evaluate_densities(instance, geometry, settings, o, d)
+    expected = one_by_one(rgb, instance, geometry, settings, o, d)
+    np.testing.assert_allclose(result, expected, rtol=0.02)
+    assert np.abs(result / expected - 1).max() > 1e-6
+
+
+def test_rough_integrals_keep_the_steps_of_voxels(rgb):
+    """Longer steps would pass over this sheet of one voxel."""
+    data = np.zeros((32, 32, 32, 1), np.float32)
+    data[:, :, 24] = 500
+    box = rgb.ScalarTransform4f().translate([-1, -1, -1]).scale([2, 2, 2])
+    sheet = {"type": "gridvolume", "data": rgb.TensorXf(data), "filter_type": "nearest", "to_world": box}
+    geometry = SceneGeometry(VolumeMedium(rgb.load_dict(sheet)))
+    instance, (o, d) = GazeFieldInstance(made("default recipe", BOX)), rays(12)
+    march = default_march_settings(geometry)
+    settings = replace(
+        SETTINGS, integral_tolerance=0.02, march=replace(march, step=0.5 * geometry.medium.cells.min_edge)
+    )
+    result = evaluate_densities(instance, geometry, settings, o, d)
+    np.testing.assert_allclose(result, one_by_one(rgb, instance, geometry, settings, o, d), rtol=1e-4)

@@ -368,7 +368,7 @@ def test_narrow_lobes_need_more_directions(turned):
         (1e-4, FIRST_DIRECTIONS),
         (USUAL_TOLERANCE, FIRST_DIRECTIONS),
         (1.9 * USUAL_TOLERANCE, FIRST_DIRECTIONS // 2),
-        (4 * USUAL_TOLERANCE, FIRST_DIRECTIONS // 4),
+        (4 * USUAL_TOLERANCE, FIRST_DIRECTIONS // 8),
         (1.0, MIN_DIRECTIONS),
     ],
 )
