@@ -12,8 +12,9 @@ import numpy as np
 
 _RAYS_PER_PARTICIPANT = 5.0  # Independent rays that a participant counts as
 _NUM_PSEUDO_RAYS = 5.0
-# Fractions of the pseudo-rays; that of the hits is divided between their kernels
-_FIELD, _PRIOR, _HITS = 0.85, 0.10, 0.05
+SURFACES, NO_SURFACES = (0.85, 0.10, 0.05), (0.3, 0.5, 0.2)
+"""Fractions of the pseudo-rays: of the field, of the prior, and of all kernels of re-aimed hits together. Without
+surfaces a field can only interpolate between positions, and is trusted less."""
 MAX_STACKED = 6  # Maximum number of kernels of re-aimed hits in a mixture, because each costs time
 _MIN_WEIGHT = 0.02  # Minimum weight of a kernel, for the same reason
 _NEGLIGIBLE_WEIGHT = 0.002  # Weight below which a kernel leaves at once
@@ -50,16 +51,18 @@ def fit_weights(
     return weights
 
 
-def fit_sparse_weights(log_densities: np.ndarray, participant: np.ndarray) -> np.ndarray:
+def fit_sparse_weights(
+    log_densities: np.ndarray, participant: np.ndarray, fractions: tuple[float, float, float] = SURFACES
+) -> np.ndarray:
     """Fit the weights (2 + K,) of a field, of the prior, and of K kernels of re-aimed hits, in this order; those of all
     but a few kernels are zero.
 
-    The arguments are those of `fit_weights`.
+    ``fractions``: of the pseudo-rays, `SURFACES` or `NO_SURFACES`; the other arguments are those of `fit_weights`.
     """
     hits = np.arange(2, len(log_densities))
 
     def fit(start: np.ndarray | None = None) -> np.ndarray:
-        return fit_weights(log_densities[[0, 1, *hits]], participant, _make_pseudo_rays(len(hits)), start)
+        return fit_weights(log_densities[[0, 1, *hits]], participant, _make_pseudo_rays(len(hits), *fractions), start)
 
     fitted = fit()
     # One by one, because the weight of a kernel moves to those that resemble it, and the largest ones may all be alike;
@@ -75,6 +78,6 @@ def fit_sparse_weights(log_densities: np.ndarray, participant: np.ndarray) -> np
     return weights
 
 
-def _make_pseudo_rays(num_kernels: int) -> np.ndarray:
-    fractions = np.array([_FIELD, _PRIOR, *[_HITS / max(num_kernels, 1)] * num_kernels])
+def _make_pseudo_rays(num_kernels: int, field: float, prior: float, hits: float) -> np.ndarray:
+    fractions = np.array([field, prior, *[hits / max(num_kernels, 1)] * num_kernels])
     return _NUM_PSEUDO_RAYS * fractions / fractions.sum()

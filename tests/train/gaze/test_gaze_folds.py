@@ -102,11 +102,11 @@ def test02_the_best_weight_is_selected_where_the_field_is_clearly_better():
     gains[:, last] = 0
     gains[:, 2], gains[:, 8] = (0.4, 0.6), (0.29, 0.31)
     assert _select_weight(gains) == 2
-    # After two standard errors nothing is left of 0.15, and 0.04 of 0.05.
-    gains[:, 2], gains[:, 8] = (0.05, 0.25), (0.045, 0.055)
-    assert _select_weight(gains, caution=2.0) == 8
-    gains[:, 8] = (-0.05, 0.15)
-    assert _select_weight(gains, caution=2.0) == last and _select_weight(gains, caution=0.0) == 2
+    # After a standard error less than nothing is left of 0.11, and 0.045 of 0.05.
+    gains[:, 2], gains[:, 8] = (-0.01, 0.23), (0.045, 0.055)
+    assert _select_weight(gains) == 8
+    gains[:, 8] = (-0.06, 0.15)
+    assert _select_weight(gains) == last
 
 
 def test03_the_weight_maximises_the_held_out_likelihood():

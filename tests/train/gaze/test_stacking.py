@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from nerg_mi.train.stacking import MAX_STACKED, fit_sparse_weights, fit_weights
+from nerg_mi.train.stacking import MAX_STACKED, NO_SURFACES, SURFACES, fit_sparse_weights, fit_weights
 
 
 def test_weights_maximise_the_penalised_likelihood():
@@ -51,3 +51,14 @@ def test_few_kernels_have_weight():
     useless = np.where(np.arange(38)[:, None] < 2, 0.0, -9.0) * np.ones(800)
     assert np.flatnonzero(fit_sparse_weights(useless, participant)).tolist() == [0, 1]
     assert np.flatnonzero(fit_sparse_weights(log[:2], participant)).tolist() == [0, 1]
+
+
+def test_without_surfaces_the_field_needs_more_evidence():
+    """With less evidence than pseudo-rays, the fractions of these decide."""
+    log, participant = np.zeros((2, 4)), np.zeros(4, int)
+    for fractions in (SURFACES, NO_SURFACES):
+        field, prior, _ = fractions
+        np.testing.assert_allclose(
+            fit_sparse_weights(log, participant, fractions), np.array([field, prior]) / (field + prior)
+        )
+    assert NO_SURFACES[0] < SURFACES[0]
