@@ -231,6 +231,24 @@ def test_areas_move_without_an_environment():
 
 
 @pytest.mark.usefixtures("rgb")
+def test_a_volume_occludes_objects():
+    import mitsuba as mi
+
+    to_world = mi.ScalarTransform4f().translate([4, -1, -1]).scale([1, 2, 2])
+    fog = {"type": "nerg", "density": {"type": "constvolume", "value": 500.0, "to_world": to_world}}
+    scene = {"type": "scene", "integrator": fog, "box": cube(np.array([[2.0, -0.2, -0.2], [2.4, 0.2, 0.2]]))}
+    rays = Rays.from_arrays(np.zeros((8, 3)), [[1.0, 0, 0]] * 8, times=np.arange(8) / 4)
+    # In front of the volume, behind it from 0.5 to 1.25 s, and in front of it again.
+    places = [[k, 0, 0] for k in (0, 0, 4, 4, 1, 1)]
+    jumps = ObjectPoses.from_arrays(["box"] * 6, [0, 0.5, 0.5, 1.25, 1.25, 2], places)
+    areas = {"box": {"shape": "box"}, "fog": [[4, -1, -1], [5, 1, 1]]}
+    rows = {row["aoi"]: row for row in statistics([rays, scene], areas, objects=jumps, **FREE).aois}
+    assert rows["box"]["share"] == pytest.approx(5 / 8) and rows["fog"]["share"] == pytest.approx(3 / 8)
+    assert rows["box"]["distance"] == pytest.approx((2 * 2 + 3 * 3) / 5, rel=1e-3)
+    assert rows["fog"]["distance"] == pytest.approx(4, abs=0.02)
+
+
+@pytest.mark.usefixtures("rgb")
 def test_gaze_on_an_object_lies_on_its_surface_at_rest():
     rays = people()
     on_box = to_object_frame(rays, poses(), "box", room())
