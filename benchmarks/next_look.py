@@ -57,9 +57,6 @@ def main(argv=None) -> None:
 
 def run_looks(args) -> None:
     """Print the table of looks."""
-    from nerg_mi.cli.declarations import select_backend
-
-    select_backend("llvm_ad_rgb", args.threads)
     each: list[dict] = []
     for name, make in parse_environments(args).items():
         folder, rays, where = write_place(name, make, args)

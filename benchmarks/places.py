@@ -88,7 +88,10 @@ def parse_environments(args: argparse.Namespace) -> dict[str, Make]:
 
 
 def write_place(name: str, make: Make, args: argparse.Namespace) -> tuple[Path, Path, str | Path]:
-    """``(folder, rays, where)`` of a scene, below the output folder."""
+    """``(folder, rays, where)`` of a scene, below the output folder. Chooses the variant, which scenes need."""
+    from nerg_mi.cli.declarations import select_backend
+
+    select_backend("llvm_ad_rgb", args.threads)
     folder = args.out / name
     folder.mkdir(exist_ok=True)
     return folder, *make(folder)
@@ -218,13 +221,11 @@ def main(argv=None) -> None:
 
 def evaluate(name: str, make: Make, args: argparse.Namespace):
     """The results of `nerg eval folds` for a scene."""
-    from nerg_mi.cli.declarations import select_backend
     from nerg_mi.evaluation.folds import folds
     from nerg_mi.progress import TerminalReporter
     from nerg_mi.tasks.settings import Parallel
     from nerg_mi.train.gaze_recipes import get_recipe
 
-    select_backend("llvm_ad_rgb", args.threads)
     folder, rays, where = write_place(name, make, args)
     recipe = get_recipe(args.recipe)
     if args.prior_kappa is not None:

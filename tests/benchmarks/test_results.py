@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from nerg_mi.scenes.store import SCENE_FILE
 
+from nerg_mi.tracking.rays import Rays
 from tests.conftest import ROOT
 from tests.test_docs import check_command, commands
 from tools import results
@@ -170,22 +171,36 @@ def test_variants_of_the_paper_are_compared_fold_by_fold(benchmark):
     assert claims.order(rows[::2])[0][4] == "+0.100"
 
 
-def test_viewer_frames_of_a_new_process(tmp_path):
-    """It chooses a variant itself; without the compiled copy, which takes long to make."""
-    pytest.importorskip("viser")
-    code = """
-    import sys
-    from pathlib import Path
-    import viewer_frames
-    from tools import results
-
-    results.LATEST, measure = Path(sys.argv[1]), viewer_frames.measure
-    viewer_frames.measure = lambda *args: [] if args[-1] else measure(*args)
-    viewer_frames.main([sys.argv[2], "--width", "64", "--seconds", "0.5"])
-    """
+def run_alone(folder, code: str) -> None:
+    """Run ``code`` in a new process, which has no variant yet, and writes its results into ``folder``."""
     path = os.pathsep.join(map(str, (ROOT, ROOT / "benchmarks")))
-    line = [sys.executable, "-c", textwrap.dedent(code), str(tmp_path), str(SCENE_FILE)]
+    begin = f"from pathlib import Path\nfrom tools import results\nresults.LATEST = Path({str(folder)!r})\n"
+    line = [sys.executable, "-c", begin + textwrap.dedent(code)]
     subprocess.run(line, env={**os.environ, "PYTHONPATH": path}, check=True)
+
+
+def test_environments_of_the_paper_in_a_new_process(tmp_path):
+    code = f"""
+    import paper_claims
+
+    paper_claims.ablation.main = lambda line: []
+    paper_claims.main(["--only", "generated-corridor", "--folds", "1", "--out", {str(tmp_path)!r}])
+    """
+    run_alone(tmp_path, code)
+    assert len(Rays.load(tmp_path / "generated-corridor" / "rays.npz")) > 1000
+
+
+def test_viewer_frames_of_a_new_process(tmp_path):
+    """Without the compiled copy, which takes long to make."""
+    pytest.importorskip("viser")
+    code = f"""
+    import viewer_frames
+
+    measure = viewer_frames.measure
+    viewer_frames.measure = lambda *args: [] if args[-1] else measure(*args)
+    viewer_frames.main([{str(SCENE_FILE)!r}, "--width", "64", "--seconds", "0.5"])
+    """
+    run_alone(tmp_path, code)
     made, published = results.read("viewer", tmp_path), results.read("viewer")
     assert made["columns"] == published["columns"]
     assert [row[:2] for row in made["rows"]] == [row[:2] for row in published["rows"][2:]]
