@@ -336,14 +336,16 @@ def save_kinds(name: str, rows: list[dict], seeds: str) -> None:
 
 
 def save_regions(name: str, rows: list[dict], seeds: str) -> None:
-    """Fractions of the held-out rays in regions of the field at recorded and at new positions, means over folds."""
+    """Fractions of the held-out rays in regions of the field at recorded and at new positions, means over folds; empty
+    without calibration."""
     from nerg_mi.evaluation.position_scores import AWAY, RECORDED
 
     by, levels, table = {(row["place"], row["method"]): row for row in rows}, ("50%", "80%", "95%"), []
     for place in dict.fromkeys(row["place"] for row in rows):
         for kind in (RECORDED, AWAY):
             methods = f"{OURS}, {kind}", f"{OURS}, {kind}, calibrated"
-            cells = [f"{100 * by[place, method][level]:.0f}" for method in methods for level in levels]
+            rows_of = [by.get((place, method)) for method in methods]
+            cells = [f"{100 * row[level]:.0f}" if row else "" for row in rows_of for level in levels]
             table.append([place, kind, *cells])
     head = [*(f"{level[:-1]} %" for level in levels), *(f"{level[:-1]} %, calibrated" for level in levels)]
     save_result(name, ("scene", "positions", *head), table, seeds)
@@ -374,7 +376,7 @@ def save_uncertainty(name: str, rows: list[dict], seeds: str) -> None:
     for place in places:
         r = by[place, "support", "both", "KLD"]
         ranks = [rho(place, "both", error) for error in ("KLD", "excess")]
-        regions = [f"{r[key]:.0%}" for key in ("of 80%", "of 80%, calibrated")]
+        regions = ["" if isnan(r[key]) else f"{r[key]:.0%}" for key in ("of 80%", "of 80%, calibrated")]
         table.append([place, *ranks, f"{r['100%']:.2f}, {r['50%']:.2f}", *regions])
     head = ["scene", "rho, KLD", "rho, excess KLD", "KLD: all, half with most support"]
     save_result(name, [*head, "coverage of 80 % regions", "calibrated"], table, seeds)

@@ -156,6 +156,20 @@ def test_the_best_baseline_of_a_score_has_the_best_mean(benchmark):
     assert latest("room")["columns"] == results.read("gaze-recorded")["columns"]
 
 
+def test_regions_of_a_field_that_is_not_calibrated(benchmark):
+    from nerg_mi.evaluation.position_scores import AWAY, RECORDED
+
+    places, levels = benchmark("places"), {"50%": 0.4, "80%": 0.7, "95%": 0.9}
+    rows = [{"place": "room", "method": f"{places.OURS}, {kind}", **levels} for kind in (RECORDED, AWAY)]
+    places.save_regions("room", rows, "0")
+    assert [row[2:] for row in latest("room")["rows"]] == [["40", "70", "90", "", "", ""]] * 2
+    ranks = {"signal": "support", "split": "both", "rho": np.nan, "100%": 0.5, "50%": 0.4}
+    regions = {"of 80%": 0.7, "of 80%, calibrated": np.nan}
+    unsure = [{"place": "room", "error": error, **ranks, **regions} for error in ("KLD", "excess")]
+    places.save_uncertainty("unsure", unsure, "0")
+    assert latest("unsure")["rows"] == [["room", "too few", "too few", "0.50, 0.40", "70%", ""]]
+
+
 def test_variants_of_the_paper_are_compared_fold_by_fold(benchmark):
     claims = benchmark("paper_claims")
     cc = {"emit_capture": (0.5, 0.7), "emit": (0.6, 0.6)}
