@@ -409,15 +409,9 @@ class _Analysis:
             check_objects(context.moving, iter_blocks(rays, self.counting.rules), self.reporter)
         has_gaze = self.placed.sampler is not None
         picks = has_gaze or self.counting.has_error
-
-        def pick(block: Rays) -> None:
-            if picks:
-                picker.add(block, context)
-
-        blocks = self._count_blocks(rays, context, pick, count)
-        if self.parts is not None:
-            blocks = self.parts.count(rays, context, pick if picks else None)
-        sums = merge_sums(blocks)
+        on_block = (lambda block: picker.add(block, context)) if picks else None
+        count_blocks = self._count_blocks if self.parts is None else self.parts.count
+        sums = merge_sums(count_blocks(rays, context, on_block))
         self.reporter.message(f"{count:,} rays of {len(sums.find_participants(ALL)[0]):,} participants")
         viewpoints = picker.viewpoints()
         if has_gaze:
@@ -441,15 +435,16 @@ class _Analysis:
         return AoiContext(self.placed, self.counting, hits, tuple(sorted(rays.cohorts)))
 
     def _count_blocks(
-        self, rays: Rays | RayDataset, context: AoiContext, pick: Callable[[Rays], None], count: int
+        self, rays: Rays | RayDataset, context: AoiContext, on_block: Callable[[Rays], None] | None
     ) -> Iterator[VisitSums]:
-        """Yield the sums of each block, computed in this process."""
-        done = 0
+        """Yield the sums of each block, computed in this process, and call ``on_block`` with it."""
+        done, count = 0, len(rays)
         with Interruption() as stop:
             for block in iter_blocks(rays, self.counting.rules):
                 stop.check()
                 yield count_block(block, context)
-                pick(block)
+                if on_block is not None:
+                    on_block(block)
                 done += len(block)
                 self.reporter.progress(0.8 * done / count, f"{done:,} of {count:,} rays")
 
@@ -500,17 +495,13 @@ class _Analysis:
             self.reporter.progress(0.95, "power of differences")
             power_table = power_rows(names, people, floor, power, seed=seed)
         differences = difference_rows(names, people, floor, resamples=self.resamples, seed=seed)
-        result = StatisticsResult(aois=rows, differences=differences, power=power_table, sums=sums)
-        if sums is None:
-            return result
+        recorded: dict[str, Any] = {}
         if attention.error is not None:
-            result = replace(result, **self._make_tracker_tables(attention.error, attention.viewpoints.positions))
-        return replace(
-            result,
-            transitions=transition_rows(sums, floor),
-            durations=duration_rows(sums, floor),
-            participants=self._list_participants(sums, show_names, salt),
-        )
+            recorded |= self._make_tracker_tables(attention.error, attention.viewpoints.positions)
+        if sums is not None:
+            recorded |= {"transitions": transition_rows(sums, floor), "durations": duration_rows(sums, floor)}
+            recorded["participants"] = self._list_participants(sums, show_names, salt)
+        return StatisticsResult(aois=rows, differences=differences, power=power_table, sums=sums, **recorded)
 
     def _make_tracker_tables(self, sums: VisitSums, observers: np.ndarray) -> dict[str, list[Row]]:
         """Return the tables of the tracker's error, from sums with the disturbed samples."""
