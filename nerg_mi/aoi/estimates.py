@@ -9,7 +9,7 @@ import numpy as np
 
 # ---- Estimates and differences ----
 
-MIN_PARTICIPANTS = 3
+MIN_FOR_INTERVAL = 3
 """Minimum number of participants, and of those with non-zero values, for a confidence interval."""
 
 
@@ -116,7 +116,7 @@ def estimate_ratios(
             m, variance = _weighted_moments(w, x, y)
             t[part] = _studentize(m - value, variance * factor, linear_error)
     c = np.where(
-        (x != 0).sum(axis=0) >= MIN_PARTICIPANTS, np.maximum(_bootstrap_quantile(t, error), min_quantile), np.nan
+        (x != 0).sum(axis=0) >= MIN_FOR_INTERVAL, np.maximum(_bootstrap_quantile(t, error), min_quantile), np.nan
     )
     c_high = np.fmax(c, _smoothed_quantile(x, y, value, (linear_error, error), resamples, seed))
     low, high = value - c * error, value + c_high * error
@@ -157,7 +157,7 @@ def estimate_ratio_differences(first: Pair, second: Pair, *, resamples: int = RE
             np.where(contributors_first, contributors_first, contributors_both),
             np.where(contributors_second, contributors_second, contributors_both),
         )
-        >= MIN_PARTICIPANTS
+        >= MIN_FOR_INTERVAL
     )
     half_width = np.where(is_sufficient, _bootstrap_quantile(t, error) * error, np.nan)
     low, high = value - half_width, value + half_width
@@ -193,7 +193,7 @@ def _bessel_factor(num_participants: np.ndarray) -> np.ndarray:
 
 def _standard_error(parts: np.ndarray, num_participants: np.ndarray) -> np.ndarray:
     """Return the standard error (K,) of a sum of independent ``parts`` (P, K), NaN for too few participants."""
-    return np.where(num_participants >= MIN_PARTICIPANTS, np.sqrt((parts**2).sum(axis=0)), np.nan)
+    return np.where(num_participants >= MIN_FOR_INTERVAL, np.sqrt((parts**2).sum(axis=0)), np.nan)
 
 
 def _studentize(deviation: np.ndarray, variance: np.ndarray, standard_error: np.ndarray) -> np.ndarray:
@@ -290,7 +290,7 @@ def _noise_sd(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         variance = (np.where(is_contributor, rate - mean, 0.0) ** 2).sum(axis=0) / (n - 1)
         # A log-normal distribution has this standard deviation of the logarithm for the coefficient of variation.
         spread = np.minimum(np.sqrt(np.log1p(variance / mean**2)), _MAX_SPREAD)
-        return np.where(n >= MIN_PARTICIPANTS, BANDWIDTH * n**-0.2 * spread, 0.0)
+        return np.where(n >= MIN_FOR_INTERVAL, BANDWIDTH * n**-0.2 * spread, 0.0)
 
 
 # ---- Proportions ----
@@ -319,7 +319,7 @@ def estimate_proportions(x: np.ndarray, y: np.ndarray) -> Estimates:
     with np.errstate(divide="ignore", invalid="ignore"):
         value = x.sum(axis=0) / num_participants
     low, high = mid_p_interval(x.sum(axis=0), num_participants)
-    is_too_few = num_participants < MIN_PARTICIPANTS
+    is_too_few = num_participants < MIN_FOR_INTERVAL
     return Estimates(
         value, np.where(is_too_few, np.nan, low), np.where(is_too_few, np.nan, high), num_participants.astype(int)
     )
@@ -368,5 +368,5 @@ def estimate_proportion_differences(
         error = np.sqrt(np.maximum(variance, 0.0))
         p = 2 * ndtr(-np.abs(b - a) / error)
     low, high = np.maximum(b - a - _Z * error, -1.0), np.minimum(b - a + _Z * error, 1.0)
-    is_too_few = (m < MIN_PARTICIPANTS) | (n < MIN_PARTICIPANTS)
+    is_too_few = (m < MIN_FOR_INTERVAL) | (n < MIN_FOR_INTERVAL)
     return Differences(value, *(np.where(is_too_few, np.nan, w) for w in (low, high, p)))

@@ -15,7 +15,7 @@ from itertools import combinations
 
 import numpy as np
 
-from .estimates import MIN_PARTICIPANTS, Pair, estimate_proportion_differences, estimate_ratio_differences
+from .estimates import MIN_FOR_INTERVAL, Pair, estimate_proportion_differences, estimate_ratio_differences
 from .tables import COMPARED_MEASURES, MAX_COMPARED_VALUES, MEASURED, MEASURES, MinParticipantsFilter, Participants, Row
 from .visits import ALL, Cell
 
@@ -95,8 +95,8 @@ def estimate_power(
 def find_power_fault(first: Pair, second: Pair, effect: float, upper_limit: float = np.inf) -> str:
     """Return why `estimate_power` has no result for these arguments; "" if it has one."""
     (x, y), (u, _) = first, second
-    if min((x != 0).sum(), (u != 0).sum()) < MIN_PARTICIPANTS:
-        return f"undefined, fewer than {MIN_PARTICIPANTS} participants with values other than 0"
+    if min((x != 0).sum(), (u != 0).sum()) < MIN_FOR_INTERVAL:
+        return f"undefined, fewer than {MIN_FOR_INTERVAL} participants with values other than 0"
     target = x.sum() / y.sum() * (1 + effect)
     return f"undefined, the effect leads to {target:.3g}, above {upper_limit:g}" if target > upper_limit else ""
 
@@ -104,7 +104,7 @@ def find_power_fault(first: Pair, second: Pair, effect: float, upper_limit: floa
 def power_rows(
     areas: Sequence[str],
     cells: Mapping[Cell, Mapping[str, Participants]],
-    min_participants: MinParticipantsFilter,
+    suppression: MinParticipantsFilter,
     effect: float,
     *,
     seed: int,
@@ -141,8 +141,8 @@ def power_rows(
                 row: Row = {"cell": dimension, "first": values[0], "second": values[1], "aoi": area}
                 row |= {"measure": measure.name, "effect": effect}
                 note = find_power_fault(one, other, effect, measure.upper_limit)
-                if not min_participants.allows(int(min((one[1] > 0).sum(), (other[1] > 0).sum()))):
-                    note = min_participants.reason
+                if not suppression.admit(int(min((one[1] > 0).sum(), (other[1] > 0).sum()))):
+                    note = suppression.reason
                 power = np.full(len(PARTICIPANT_COUNTS), np.nan)
                 if not note:
                     power = estimate_power(

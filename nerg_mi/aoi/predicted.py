@@ -367,7 +367,7 @@ def what_if_rows(
     viewpoints: Viewpoints,
     before: PredictedAttention,
     predict: Predict,
-    min_participants: MinParticipantsFilter,
+    suppression: MinParticipantsFilter,
     resamples: int,
     seed: int,
 ) -> list[Row]:
@@ -387,7 +387,7 @@ def what_if_rows(
         Viewpoints and their prediction before the changes.
     predict
         Predicts the attention of viewpoints after the changes.
-    min_participants
+    suppression
         Suppresses values of few participants.
     resamples, seed
         Number and seed of the bootstrap draws.
@@ -408,7 +408,7 @@ def what_if_rows(
         for measure in ("share", "visible"):
             old_sums = _mean_by_participant(viewpoints, names, getattr(before, measure), areas, name)
             new_sums = _mean_by_participant(changed_viewpoints, names, getattr(after, measure), after_areas, name)
-            row = _what_if_row(name, measure, old_sums, new_sums, min_participants, resamples, seed)
+            row = _what_if_row(name, measure, old_sums, new_sums, suppression, resamples, seed)
             row["difference_spread"] = None
             reasons = {"": [], _NO_SUPPORT if support is None else "": ["support"]}
             if measure == "share" and row["difference"] is not None and len(after.members) > 1:
@@ -446,11 +446,11 @@ def _overall_mean(pair: tuple[np.ndarray, np.ndarray]) -> float:
 
 
 def _what_if_row(
-    name: str, measure: str, old, new, min_participants: MinParticipantsFilter, resamples: int, seed: int
+    name: str, measure: str, old, new, suppression: MinParticipantsFilter, resamples: int, seed: int
 ) -> Row:
     mean = lambda pair: _overall_mean(pair) if pair[1].sum() else None
     num_participants = int(min(old[1].sum() or new[1].sum(), new[1].sum() or old[1].sum()))
-    is_allowed = min_participants.allows(num_participants)
+    is_allowed = suppression.admit(num_participants)
     row: Row = {"aoi": name, "measure": measure, "participants": num_participants if is_allowed else None}
     row |= {"before": mean(old) if is_allowed else None, "after": mean(new) if is_allowed else None}
     has_both = bool(old[1].sum() and new[1].sum())
@@ -460,4 +460,4 @@ def _what_if_row(
     number = lambda v: float(v[0]) if np.isfinite(v[0]) else None
     keys = {"difference": "value", "low": "low", "high": "high", "p": "p"}
     row |= {k: None if differences is None else number(getattr(differences, v)) for k, v in keys.items()}
-    return row | {"note": explain_difference(row, has_both, min_participants, is_allowed)}
+    return row | {"note": explain_difference(row, has_both, suppression, is_allowed)}

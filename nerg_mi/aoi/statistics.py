@@ -33,7 +33,7 @@ from nerg_mi.transport.observer import sensor_center
 
 from .areas import AnyAreas, Areas, to_json_values
 from .changes import open_changes
-from .estimates import MIN_PARTICIPANTS
+from .estimates import MIN_FOR_INTERVAL
 from .measured import AoiContext, Counting, TimeWindow, count_block, iter_blocks
 from .moving import check_objects
 from .objects import ObjectPoses
@@ -251,12 +251,12 @@ def statistics(
                     attention.viewpoints,
                     attention.predicted,
                     predict,
-                    work.floor,
+                    work.suppression,
                     resamples,
                     seed,
                 )
                 result = replace(result, what_if=rows)
-        if num_suppressed := work.floor.num_suppressed:
+        if num_suppressed := work.suppression.num_suppressed:
             reporter.message(
                 f"{num_suppressed:,} numbers rest on fewer than {min_participants} participants and are blank"
             )
@@ -334,11 +334,12 @@ def _open_parts(
 
 @dataclass(frozen=True, eq=False)
 class _Attention:
-    """Attention of participants by cell and source: ``sums`` of recordings, all sums with those of samples with added
-    ``error``, and what a gaze field predicts from ``viewpoints``, with the recorded ``times`` of participants."""
+    """Attention of participants by cell and source: ``sums`` of recordings, all sums with those of
+    ``disturbed`` samples, and what a gaze field predicts from ``viewpoints``, with the recorded ``times`` of
+    participants."""
 
     sums: VisitSums | None
-    error: VisitSums | None
+    disturbed: VisitSums | None
     viewpoints: Viewpoints
     predicted: PredictedAttention | None
     people: Mapping[Cell, Mapping[str, Participants]]
@@ -353,7 +354,7 @@ class _Analysis:
     rays: Rays | RayDataset | None
     counting: Counting
     parts: PartitionedStatistics | None
-    floor: MinParticipantsFilter
+    suppression: MinParticipantsFilter
     resamples: int
     seed: int
     reporter: Reporter
@@ -377,11 +378,11 @@ class _Analysis:
         """Count visits, and predict the attention from recorded positions or those of observers."""
         people: dict[Cell, dict[str, Participants]] = {ALL: {}}
         times: dict[Cell, dict[str, float]] = {}
-        error = None
+        disturbed = None
         if self.rays is not None:
             counted, viewpoints = self._count(self.rays, num_viewpoints)
             sums = counted.select_draw(0)
-            error = counted if self.counting.has_error else None
+            disturbed = counted if self.counting.has_error else None
             for cell in sums.cells:
                 tracked = Participants.from_sums(sums, cell, self.counting.aoi_visibility)
                 people[cell] = {MEASURED: tracked}
@@ -400,7 +401,7 @@ class _Analysis:
                     people[cell][PREDICTED] = predicted_people
         _report_small_groups(people, self.reporter)
         _report_values_without_comparison(people, self.reporter)
-        return _Attention(sums, error, viewpoints, predicted, people, times)
+        return _Attention(sums, disturbed, viewpoints, predicted, people, times)
 
     def _count(self, rays: Rays | RayDataset, num_viewpoints: int) -> tuple[VisitSums, Viewpoints]:
         context, count = self._make_context(rays), len(rays)
@@ -483,23 +484,26 @@ class _Analysis:
         self, attention: _Attention, power: float | None, show_names: bool, salt: FilePath | None
     ) -> StatisticsResult:
         """Return all tables except that of changes."""
-        sums, people, floor, seed = attention.sums, attention.people, self.floor, self.seed
+        sums, people, suppression, seed = attention.sums, attention.people, self.suppression, self.seed
         names = self.placed.areas.names
         self.reporter.progress(0.9, "confidence intervals")
-        rows = aoi_rows(names, people, floor, resamples=self.resamples, seed=seed)
+        rows = aoi_rows(names, people, suppression, resamples=self.resamples, seed=seed)
         if attention.predicted is not None:
             duration = self.placed.sampling.glance_duration
             add_uncertainty(rows, attention.predicted, attention.viewpoints, attention.times, duration)
         power_table = []
         if power is not None:
             self.reporter.progress(0.95, "power of differences")
-            power_table = power_rows(names, people, floor, power, seed=seed)
-        differences = difference_rows(names, people, floor, resamples=self.resamples, seed=seed)
+            power_table = power_rows(names, people, suppression, power, seed=seed)
+        differences = difference_rows(names, people, suppression, resamples=self.resamples, seed=seed)
         recorded: dict[str, Any] = {}
-        if attention.error is not None:
-            recorded |= self._make_tracker_tables(attention.error, attention.viewpoints.positions)
+        if attention.disturbed is not None:
+            recorded |= self._make_tracker_tables(attention.disturbed, attention.viewpoints.positions)
         if sums is not None:
-            recorded |= {"transitions": transition_rows(sums, floor), "durations": duration_rows(sums, floor)}
+            recorded |= {
+                "transitions": transition_rows(sums, suppression),
+                "durations": duration_rows(sums, suppression),
+            }
             recorded["participants"] = self._list_participants(sums, show_names, salt)
         return StatisticsResult(aois=rows, differences=differences, power=power_table, sums=sums, **recorded)
 
@@ -515,7 +519,7 @@ class _Analysis:
                 f"{error.precision:g} degrees"
             )
         names = self.placed.areas.names
-        corrected = tracker_rows(names, sums, error.draws, self.floor, resamples=self.resamples, seed=self.seed)
+        corrected = tracker_rows(names, sums, error.draws, self.suppression, resamples=self.resamples, seed=self.seed)
         too_small = resolution_rows(self.placed, observers, disturbance.mean_accuracy)
         if too_small:
             self.reporter.warn(
@@ -527,7 +531,7 @@ class _Analysis:
         return {"tracker": corrected, "resolution": too_small}
 
     def _list_participants(self, sums: VisitSums, show_names: bool, salt: FilePath | None) -> Sequence[Row]:
-        if self.floor.minimum > 1:
+        if self.suppression.minimum > 1:
             self.reporter.message(
                 "no table of participants is written, because each of its numbers would rest on one participant"
             )
@@ -558,11 +562,11 @@ def _report_small_groups(people: Mapping[Cell, Mapping[str, Participants]], repo
         cell
         for cell, by_source in people.items()
         for p in by_source.values()
-        if 0 < p.is_in_cell.sum() < MIN_PARTICIPANTS
+        if 0 < p.is_in_cell.sum() < MIN_FOR_INTERVAL
     ]
     if few:
         which = "the whole recording" if few[0] == ALL else f"{few[0].dimension} {few[0].value}"
         reporter.message(
-            f"there are no confidence intervals for fewer than {MIN_PARTICIPANTS} participants ({which}"
+            f"there are no confidence intervals for fewer than {MIN_FOR_INTERVAL} participants ({which}"
             + (f" and {len(set(few)) - 1} more)" if len(set(few)) > 1 else ")")
         )

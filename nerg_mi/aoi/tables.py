@@ -12,7 +12,7 @@ import numpy as np
 from nerg_mi.files.tables import join_reasons
 
 from .estimates import (
-    MIN_PARTICIPANTS,
+    MIN_FOR_INTERVAL,
     Estimates,
     Pair,
     adjust_p_values,
@@ -306,8 +306,8 @@ class MinParticipantsFilter:
         """Why a value is suppressed, for notes."""
         return f"suppressed, fewer than {self.minimum} participants"
 
-    def allows(self, num_participants: int) -> bool:
-        """Return whether a value of this many participants may be shown. A value without participants may be shown."""
+    def admit(self, num_participants: int) -> bool:
+        """Return whether a value of this many participants may be shown, as may one without any; count it if not."""
         if 0 < num_participants < self.minimum:
             self.num_suppressed += 1
             return False
@@ -317,7 +317,7 @@ class MinParticipantsFilter:
 def aoi_rows(
     areas: Sequence[str],
     cells: Mapping[Cell, Mapping[str, Participants]],
-    min_participants: MinParticipantsFilter,
+    suppression: MinParticipantsFilter,
     *,
     resamples: int,
     seed: int,
@@ -335,10 +335,10 @@ def aoi_rows(
             for source, people in sources.items():
                 row: Row = {"cell": cell.dimension, "value": cell.value, "aoi": area, "source": source}
                 count = int(people.is_in_cell.sum())
-                row["participants"] = count if min_participants.allows(count) else None
+                row["participants"] = count if suppression.admit(count) else None
                 reasons: dict[str, list[str]] = {}
                 for measure, estimate in estimates[source]:
-                    reason = _add_estimate(row, measure, estimate, a, min_participants)
+                    reason = _add_estimate(row, measure, estimate, a, suppression)
                     reasons.setdefault(reason, []).append(measure.name)
                 row["note"] = join_reasons(reasons)
                 rows.append(row)
@@ -346,7 +346,7 @@ def aoi_rows(
 
 
 def _add_estimate(
-    row: Row, measure: Measure, estimate: Estimates | None, a: int, min_participants: MinParticipantsFilter
+    row: Row, measure: Measure, estimate: Estimates | None, a: int, suppression: MinParticipantsFilter
 ) -> str:
     """Add the estimate of a measure for the area ``a`` to ``row``. Return why it has no value or interval; "" if it
     has both."""
@@ -355,8 +355,8 @@ def _add_estimate(
     if estimate is None:
         return _NOT_COMPUTED if measure.needs_visibility else _NOT_PREDICTED
     count = int(estimate.participants[a])
-    if not min_participants.allows(count):
-        return min_participants.reason
+    if not suppression.admit(count):
+        return suppression.reason
     value, low, high = (_finite_or_none(v[a]) for v in (estimate.value, estimate.low, estimate.high))
     row |= zip(keys, (value, low, high, count))
     if value is None:
@@ -365,13 +365,13 @@ def _add_estimate(
 
 
 _NOT_COMPUTED, _NOT_PREDICTED = "visibility is not computed", "a gaze field has no time course"
-NO_INTERVAL = f"no interval, fewer than {MIN_PARTICIPANTS} participants with values other than 0, or equal values"
+NO_INTERVAL = f"no interval, fewer than {MIN_FOR_INTERVAL} participants with values other than 0, or equal values"
 
 
-def explain_difference(row: Row, has_both: bool, min_participants: MinParticipantsFilter, is_allowed: bool) -> str:
+def explain_difference(row: Row, has_both: bool, suppression: MinParticipantsFilter, is_allowed: bool) -> str:
     """Return why a ``row`` has no difference, no interval or no p-value; "" if it has all."""
     if not is_allowed:
-        return min_participants.reason
+        return suppression.reason
     if row["difference"] is None:
         return "undefined, equal values" if has_both else "no participants on one side"
     reasons: dict[str, list[str]] = {"": []}
@@ -389,7 +389,7 @@ def _finite_or_none(value: float) -> float | None:
 def difference_rows(
     areas: Sequence[str],
     cells: Mapping[Cell, Mapping[str, Participants]],
-    min_participants: MinParticipantsFilter,
+    suppression: MinParticipantsFilter,
     *,
     resamples: int,
     seed: int,
@@ -413,7 +413,7 @@ def difference_rows(
             pair = a.align_to(names), b.align_to(names)
             for measure in (m for m in MEASURES if m.name in measures):
                 rows += _measure_differences(
-                    areas, dimension, (first.value, second.value), measure, pair, min_participants, resamples, seed
+                    areas, dimension, (first.value, second.value), measure, pair, suppression, resamples, seed
                 )
     add_adjusted_p(rows)
     for row in rows:
@@ -434,7 +434,7 @@ def _measure_differences(
     values: tuple[str, str],
     measure: Measure,
     participants: tuple[Participants, Participants],
-    min_participants: MinParticipantsFilter,
+    suppression: MinParticipantsFilter,
     resamples: int,
     seed: int,
 ) -> list[Row]:
@@ -448,18 +448,18 @@ def _measure_differences(
     num_participants = np.minimum((first[1] > 0).sum(axis=0), (second[1] > 0).sum(axis=0))
     rows = []
     for a, area in enumerate(areas):
-        is_allowed = min_participants.allows(int(num_participants[a]))
+        is_allowed = suppression.admit(int(num_participants[a]))
         row: Row = {"cell": dimension, "first": values[0], "second": values[1], "aoi": area, "measure": measure.name}
         for key in ("value", "low", "high", "p"):
             row["difference" if key == "value" else key] = (
                 _finite_or_none(getattr(differences, key)[a]) if is_allowed else None
             )
-        row["note"] = explain_difference(row, num_participants[a] > 0, min_participants, is_allowed)
+        row["note"] = explain_difference(row, num_participants[a] > 0, suppression, is_allowed)
         rows.append(row)
     return rows
 
 
-def transition_rows(sums: VisitSums, min_participants: MinParticipantsFilter) -> list[Row]:
+def transition_rows(sums: VisitSums, suppression: MinParticipantsFilter) -> list[Row]:
     """Return the transitions between areas in each cell: ``from``, ``to``, the number of ``transitions``, and their
     ``share`` of all transitions from that area. The ``note`` says why they are None."""
     rows = []
@@ -467,15 +467,15 @@ def transition_rows(sums: VisitSums, min_participants: MinParticipantsFilter) ->
         num_participants = len(sums.find_participants(cell)[0])
         total = sums.transitions[c].sum(axis=1)
         for i, j in np.argwhere(sums.transitions[c] > 0):
-            is_allowed = min_participants.allows(num_participants)
+            is_allowed = suppression.admit(num_participants)
             n = float(sums.transitions[c, i, j])
             row: Row = {"cell": cell.dimension, "value": cell.value, "from": sums.areas[i], "to": sums.areas[j]}
             row |= {"transitions": int(n) if is_allowed else None, "share": n / float(total[i]) if is_allowed else None}
-            rows.append(row | {"note": "" if is_allowed else min_participants.reason})
+            rows.append(row | {"note": "" if is_allowed else suppression.reason})
     return rows
 
 
-def duration_rows(sums: VisitSums, min_participants: MinParticipantsFilter) -> list[Row]:
+def duration_rows(sums: VisitSums, suppression: MinParticipantsFilter) -> list[Row]:
     """Return the histogram of visit durations of each area and cell; `BINS` are in seconds. The ``note`` says why
     counts are None."""
     rows = []
@@ -483,9 +483,9 @@ def duration_rows(sums: VisitSums, min_participants: MinParticipantsFilter) -> l
     for c, cell in enumerate(sums.cells):
         num_participants = len(sums.find_participants(cell)[0])
         for a, area in enumerate(sums.areas):
-            is_allowed = min_participants.allows(num_participants)
+            is_allowed = suppression.admit(num_participants)
             counts = {n: int(v) if is_allowed else None for n, v in zip(names, sums.duration_counts[c, a])}
-            note = "" if is_allowed else min_participants.reason
+            note = "" if is_allowed else suppression.reason
             rows.append({"cell": cell.dimension, "value": cell.value, "aoi": area, **counts, "note": note})
     return rows
 

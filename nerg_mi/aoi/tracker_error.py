@@ -133,13 +133,7 @@ CORRECTED_MEASURES = ("share", "dwell", "hit_ratio", "time_to_first_visit")
 
 
 def tracker_rows(
-    areas: Sequence[str],
-    sums: VisitSums,
-    draws: int,
-    min_participants: MinParticipantsFilter,
-    *,
-    resamples: int,
-    seed: int,
+    areas: Sequence[str], sums: VisitSums, draws: int, suppression: MinParticipantsFilter, *, resamples: int, seed: int
 ) -> list[Row]:
     """Return a row for each cell, area and corrected measure of ``sums``, which contain the draws.
 
@@ -169,12 +163,12 @@ def tracker_rows(
             columns |= {"low": estimate.low, "high": estimate.high}
             for a, area in enumerate(areas):
                 row: Row = {"cell": cell.dimension, "value": cell.value, "aoi": area, "measure": name}
-                is_allowed = min_participants.allows(len(first))
+                is_allowed = suppression.admit(len(first))
                 row["participants"] = len(first) if is_allowed else None
                 for key, column in columns.items():
                     is_shown = is_allowed and np.isfinite(column[a]) and (is_known[a] or key == "recorded")
                     row[key] = float(column[a]) if is_shown else None
-                row["note"] = _explain_row(row, is_allowed, min_participants)
+                row["note"] = _explain_row(row, is_allowed, suppression)
                 rows.append(row)
     return rows
 
@@ -190,9 +184,9 @@ def _influence(measure: Measure, people: Participants) -> np.ndarray:
         return value + (x - value * y) * len(x) / total
 
 
-def _explain_row(row: Row, is_allowed: bool, min_participants: MinParticipantsFilter) -> str:
+def _explain_row(row: Row, is_allowed: bool, suppression: MinParticipantsFilter) -> str:
     if not is_allowed:
-        return min_participants.reason
+        return suppression.reason
     if row["recorded"] is None:
         return f"no {MEASURES_BY_NAME[row['measure']].population}"
     if row["corrected"] is None:

@@ -169,10 +169,7 @@ def test_few_participants_are_suppressed():
     assert floor.num_suppressed == 2 * (1 + texts) and texts >= 7
     suppressing = MinParticipantsFilter(5)
     assert (
-        suppressing.allows(0)
-        and suppressing.allows(5)
-        and not suppressing.allows(4)
-        and suppressing.num_suppressed == 1
+        suppressing.admit(0) and suppressing.admit(5) and not suppressing.admit(4) and suppressing.num_suppressed == 1
     )
 
 
