@@ -425,7 +425,7 @@ def make_scene(
     environment : AnyEnvironment, optional
         What the observers see: a radiance field (`RadianceField`), Gaussian splats
         (`nerg_mi.fields.splats.Splats`) or a `DensityGrid`, in memory or as a file; a file of hit points (.vol) as
-        written by `train_gaze` with ``geometry="hits"``; or shapes as for ``shapes``. Hit points are grey, shaded by
+        written by `train_gaze` with ``environment="hits"``; or shapes as for ``shapes``. Hit points are grey, shaded by
         the orientation of their surfaces. Of a `Scene` of `make_scene`, or a dict of one, all is kept that no argument
         replaces: its gaze field, observer and cameras too. Of other scenes only shapes and lights are used.
     gaze : GazeField or path, optional

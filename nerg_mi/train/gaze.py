@@ -187,8 +187,8 @@ def train_gaze(
     NergError
         An argument is invalid, which is found before any time is spent where possible.
     KeyboardInterrupt
-        Ctrl-C was pressed. An ``output`` has been written. The attribute ``field`` of the exception is the field of the
-        state so far.
+        Ctrl-C was pressed. After the first step of the fit of a single field it is a `TrainingInterrupted`: an
+        ``output`` has been written, and its attribute ``field`` is the field so far.
 
     Examples
     --------
@@ -242,8 +242,15 @@ def train_gaze(
             )
             metadata |= recorded
         if test_zones and data is not None:
-            held_out = test_zones, test_positions, seed, max(64, chosen.probes.min_rays), test_participants
-            data, metadata["test"] = hold_out(data, chosen.probes.radius, *held_out)
+            data, metadata["test"] = hold_out(
+                data,
+                chosen.probes.radius,
+                zones=test_zones,
+                positions=test_positions,
+                seed=seed,
+                min_rays=max(64, chosen.probes.min_rays),
+                participant_fraction=test_participants,
+            )
             saliency = _leave_out_views(saliency, metadata["test"], 2 * chosen.probes.radius, to_scene, reporter)
         supervision = Supervision(data, saliency)
         if opened is None:
@@ -457,7 +464,9 @@ def _announce_variant(
         return
     is_chosen = plan.alternatives and selects_prior_weight(plan) and rays is not None
     how = (
-        "cross-validation chooses between capture alone and emit x capture" if is_chosen else "capture alone is trained"
+        "cross-validation chooses between capture alone and emit x capture"
+        if is_chosen
+        else f"the variant {plan.config.variant} is trained"
     )
     reporter.message(f"there is no geometry: {how}")
 

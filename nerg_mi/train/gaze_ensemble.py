@@ -113,7 +113,7 @@ def train_ensemble(
     members : int
         Number of fields, at least 2.
     supervision, geometry, plan, ns
-        As for ``gaze_run.train_gaze``. A time limit applies to all members together.
+        As for `fit_gaze`. A time limit applies to all members together.
     state : StateSettings, optional
         Run state. With a path, each finished member is stored in its own file next to the state and removed after
         ``write`` has returned; without ``write`` the members remain.

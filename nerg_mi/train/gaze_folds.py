@@ -607,7 +607,8 @@ def select_variant(
     """Select one architecture of ``plan``, and its prior weight, by folds.
 
     ``GazePlan.config`` is kept unless one of the ``alternatives`` predicts the held-out participants better by half a
-    standard error over folds, each with its own prior weight. Without alternatives, rays or folds nothing is selected.
+    standard error over participants, each with its own prior weight. Without alternatives, rays or folds nothing is
+    selected.
 
     Parameters
     ----------

@@ -65,7 +65,8 @@ def _broadcast(rows: list, like: Any) -> list:
 
 
 class LikelihoodTrainer(GazeTrainer):
-    """Trains a ``LogGazeField`` by maximum likelihood; see ``GazeTrainer``. Requires ``targets.prior_table``."""
+    """Trains a ``LogGazeField`` by maximum likelihood; see ``GazeTrainer``. The prior is ``targets.prior_table``, or
+    uniform without one."""
 
     def complete_config(self, config: LogGazeConfig, targets: GazeTargets) -> LogGazeConfig:
         # Capture's encoding spans the observer positions.

@@ -97,7 +97,8 @@ class Recipe:
     def override(self, **settings: Any) -> Recipe:
         """Return the recipe with other ``settings``: fields of `ProbeSettings` and `GazeSettings`.
 
-        None stands for the value of the recipe. If only one of minutes and steps is given, it replaces the other.
+        ``probes`` and ``directions``, which both have, are those of `ProbeSettings`. None stands for the value of the
+        recipe. If only one of minutes and steps is given, it replaces the other.
         """
         values = {name: value for name, value in settings.items() if value is not None}
         if "minutes" in values:

@@ -34,7 +34,7 @@ CODE = {"kld": 0.0, "cc": 0.1, "mae": 1.0}  # the published code: MAE + 0.1 (1 -
 
 
 LOSSES = {"paper": PAPER, "code": CODE, "likelihood": {"kld": 1.0, "cc": 0.0, "mae": 0.0}}
-"""Weights of the terms of each loss. For "likelihood" they only define the validation objective."""
+"""Weights of the terms of each loss. Those of "likelihood" are not used: its trainer has its own loss."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class ProbeSettings(ValidatedDataclass):
 
     # The fields that are no keywords of `nerg_mi.train.gaze.train_gaze` are set by a recipe.
     radius: float = range_field(0.25, LENGTHS)
-    probes: int = range_field(2048, Range(1, 10**6))
+    probes: int = range_field(2048, Range(1, 10**6))  # Maximum number of probes
     max_rays: int = range_field(1024, Range(1, 10**6))  # Maximum number of rays in a probe; the nearest are used
     min_rays: int = range_field(64, Range(1, 10**6))
     # How the concentration of a ray's kernel is chosen: fixed (by kappa), silverman (rule of thumb) or loo

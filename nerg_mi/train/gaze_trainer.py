@@ -69,7 +69,7 @@ def compute_gaze_loss(
     solid_angle : Float, optional
         Solid angles (D,) common to all probes, or (P * D,). Default: equal.
     kld, cc, mae : float
-        Weights of the terms. :data:`PAPER` and :data:`CODE` are predefined: ``compute_gaze_loss(..., **CODE)``.
+        Weights of the terms. `gaze_settings.LOSSES` has those of each loss, such as ``**LOSSES["paper"]``.
 
     Raises
     ------

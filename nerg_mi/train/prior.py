@@ -169,8 +169,8 @@ def make_prior_from_views(views: Sequence[SalienceView], rows: int) -> np.ndarra
 #
 # A gaze field for an environment without recordings: the distribution of the gaze elevation in other environments.
 #
-# Among the candidates tried, only the elevation transfers between environments (docs/gaze-evaluation.md): laws of
-# distance or incidence fitted in other environments predict gaze worse.
+# Among the candidates tried, only the elevation transfers between environments (docs/how-to/evaluation.md): laws
+# of distance or incidence fitted in other environments predict gaze worse.
 
 ELEVATION_KAPPA = 30.0  # Concentration of the kernel of a ray
 ELEVATION_PRIOR = "prior"  # Recipe in the provenance of such a field

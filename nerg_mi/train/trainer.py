@@ -1,4 +1,4 @@
-"""Common parts of radiance and gaze training: settings, averaged weights, run state and step clock."""
+"""Common parts of radiance and gaze training: the loop over steps, averaged weights, run state, step clock."""
 
 from __future__ import annotations
 

@@ -133,7 +133,11 @@ def test_without_geometry_folds_select_the_variant(rays):
     heard = Listener()
     result = train_gaze(rays, "none", **{**QUICK, "prior_folds": 0}, progress=heard)
     assert result.network.config.variant == "capture" and "mix" not in result.provenance
-    assert heard.messages[0] == "there is no geometry: capture alone is trained"
+    assert heard.messages[0] == "there is no geometry: the variant capture is trained"
+    # Nor if the recipe has one.
+    heard = Listener()
+    train_gaze(rays, "none", **FOLDED, recipe=change("default", {"variant": "emit_capture"}), progress=heard)
+    assert heard.messages[0] == "there is no geometry: the variant emit_capture is trained"
 
 
 def test_function_and_command_write_equal_files(rays, tmp_path, capsys, single_thread):
