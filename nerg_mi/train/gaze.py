@@ -462,7 +462,7 @@ def _announce_variant(
     """Tell how the variant is chosen without geometry."""
     if environment.has_surfaces or variant is not None:
         return
-    is_chosen = plan.alternatives and selects_prior_weight(plan) and rays is not None
+    is_chosen = plan.alternatives and selects_prior_weight(plan, rays)
     how = (
         "cross-validation chooses between capture alone and emit x capture"
         if is_chosen

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
-from typing import NamedTuple
 
 import numpy as np
 
@@ -88,13 +87,6 @@ def resample_views(views: tuple[SalienceView, ...], seed: int | tuple[int, int])
     return tuple(views[k] for k in np.random.default_rng(seed).integers(0, len(views), len(views)))
 
 
-class TrainedEnsemble(NamedTuple):
-    """Result of an ensemble training: the ensemble and its provenance (JSON)."""
-
-    field: GazeEnsemble
-    provenance: dict
-
-
 def train_ensemble(
     members: int,
     supervision: Supervision,
@@ -105,8 +97,10 @@ def train_ensemble(
     state: StateSettings | None = None,
     on_progress: ProgressCallback | None = None,
     write: Callable[[GazeEnsemble, dict], None] | None = None,
-) -> TrainedEnsemble:
+) -> tuple[GazeEnsemble, dict]:
     """Train ``members`` gaze fields, each on its own bootstrap resample and with its own seed.
+
+    Returns the ensemble and its provenance (JSON).
 
     Parameters
     ----------
@@ -133,7 +127,7 @@ def train_ensemble(
     kind, path = _get_resampling_kind(members, supervision, plan), state.path
     # Folds of a resample would have the same participant on both sides. The prior weight is therefore selected once, on
     # the original rays.
-    selects_weight = selects_prior_weight(plan) and supervision.rays is not None
+    selects_weight = selects_prior_weight(plan, supervision.rays)
     parts = [path and path.with_name(f"{path.stem}.member{k}.safetensors") for k in range(members)]
     is_file = lambda file: file is not None and file.is_file()
     if state.resume and not any(map(is_file, (path, *parts))):
@@ -208,7 +202,7 @@ def train_ensemble(
         for part in parts:
             if part is not None:
                 part.unlink(missing_ok=True)
-    return TrainedEnsemble(ensemble, provenance)
+    return ensemble, provenance
 
 
 def _get_resampling_kind(members: int, supervision: Supervision, plan: GazePlan) -> str:

@@ -14,7 +14,6 @@ from nerg_mi.environment.environment import Environment
 from nerg_mi.errors import NergError, parameter
 from nerg_mi.fields.gaze_base import GazeHead, GazeHeadConfig, interpolate_table
 from nerg_mi.fields.gaze_hits import MAX_HITS, HitKernel, ReaimedHits, place_missing_points
-from nerg_mi.interruption import Interruption
 from nerg_mi.maths.arrays import to_vector
 from nerg_mi.photos.salience import SalienceView
 from nerg_mi.ranges import KAPPAS, LENGTHS
@@ -315,9 +314,9 @@ class PriorSelection:
         return make_hits(rays, geometry, self.hits)
 
 
-def selects_prior_weight(plan: GazePlan) -> bool:
-    """Return whether ``plan`` selects the prior by folds."""
-    return plan.settings.prior_folds > 0 and plan.config.prior > 0
+def selects_prior_weight(plan: GazePlan, rays: Rays | None) -> bool:
+    """Return whether ``plan`` selects the prior by folds of ``rays``."""
+    return plan.settings.prior_folds > 0 and plan.config.prior > 0 and rays is not None
 
 
 class FoldDensities(NamedTuple):
@@ -473,12 +472,7 @@ def evaluate_folds(
             # The remaining participants make no probe: skip this fold.
             continue
         trainer = plan.trainer(replace(targets, observer_bounds=box), geometry.box, config, settings, ns)
-        with Interruption() as stop:
-            while trainer.progress < 1:
-                trainer.step()
-                fraction = (k + trainer.progress) / settings.prior_folds
-                on_progress(GazeProgress(f"fold {k + 1}", fraction, trainer.steps, trainer.seconds, None))
-                stop.check()
+        _train(trainer, scale_progress(on_progress, k, settings.prior_folds, f"fold {k + 1}"))
         assert targets.prior_table is not None  # The field has a prior
         folds.append(_evaluate_fold(trainer, targets.prior_table, fold, geometry, plan, needs))
         if len(folds) == _MIN_FOLDS and all(map(_needs_no_prior, folds)):
@@ -489,6 +483,13 @@ def evaluate_folds(
     on_progress(GazeProgress("folds", 1.0, settings.steps or 0, 0.0, None))
     fractions = NO_SURFACES if geometry.medium is None else SURFACES
     return FoldResults(config.mix, None if config.prior_factor else kappa, folds, fractions)
+
+
+def _train(trainer: GazeTrainer, on_progress: ProgressCallback) -> None:
+    """Run all steps. Raises `KeyboardInterrupt` after Ctrl-C, or if ``on_progress`` raises it."""
+    report = lambda: on_progress(GazeProgress("", trainer.progress, trainer.steps, trainer.seconds, None))
+    if trainer.run(lambda: trainer.progress >= 1, lambda: None, report):
+        raise KeyboardInterrupt
 
 
 def _evaluate_fold(
@@ -566,16 +567,6 @@ def _calibrate_regions(folds: Sequence[FoldDensities], selection: PriorSelection
     return calibrate_levels(np.concatenate(levels), np.ones(sum(map(len, levels))))
 
 
-def within_half_se(losses: np.ndarray) -> np.ndarray:
-    """Return the columns of ``losses`` (N, S), one row per held-out participant, whose mean is within half a standard
-    error of the smallest.
-
-    The standard error is that of the difference to the best column, over participants.
-    """
-    excess = losses - losses[:, [int(losses.mean(axis=0).argmin())]]
-    return np.flatnonzero(excess.mean(axis=0) <= _SE_FACTOR * _standard_error(excess))
-
-
 def _select_weight(gains: np.ndarray) -> int:
     """Return the index of the best of S mixtures by their ``gains`` (N, S) over the prior for N participants.
 
@@ -630,7 +621,7 @@ def select_variant(
         After Ctrl-C, or if ``on_progress`` raises it.
     """
     configs, plan = (plan.config, *plan.alternatives), replace(plan, alternatives=())
-    if len(configs) == 1 or not selects_prior_weight(plan) or supervision.rays is None:
+    if len(configs) == 1 or not selects_prior_weight(plan, supervision.rays):
         return plan, None
     if resumed_identity is not None:
         return _restore_selection(plan, configs, resumed_identity)
@@ -676,7 +667,8 @@ def _select_best(
         return plan, selections[0]
     gains = [scored.compute_selected_gains(selection, count) for scored, selection in zip(results, selections)]
     losses = -np.stack(gains, axis=1)
-    k = int(within_half_se(losses)[0])
+    excess = losses - losses[:, [losses.mean(axis=0).argmin()]]
+    k = int((excess.mean(axis=0) <= _SE_FACTOR * _standard_error(excess)).argmax())  # The first that is good enough
     variants = {c.variant: float(-loss / np.log(2)) for c, loss in zip(configs, losses.mean(axis=0))}
     return replace(plan, config=configs[k]), replace(selections[k], variant=configs[k].variant, variants=variants)
 

@@ -38,7 +38,7 @@ def evaluate_log_density(field: LogGazeField, batch: GazeBatch, parameters: dict
     if config.variant != "capture":
         inputs = field.emit_inputs(batch.p_od, each, r_o)
         emit = net("emit_net").tensor(stack(_broadcast(inputs, r_o), ns)).array
-        if config.escaped != "nearest":
+        if not config.fills_escaped:
             one = dr.zeros(ns.UInt32, dr.width(r_o))
             escaped = dr.gather(ns.Float, parameters["escaped"], one, mode=dr.ReduceMode.Expand)
             emit = dr.select(batch.misses, escaped, emit)
@@ -84,7 +84,7 @@ class LikelihoodTrainer(GazeTrainer):
         """Select the trainable ``parameters``: all but the position-independent prior and what the variant does not
         use."""
         unused = {"emit": ("capture_net",), "capture": ("emit_net", "grid", "escaped")}.get(self.config.variant, ())
-        if self.config.escaped == "nearest":
+        if self.config.fills_escaped:
             unused += ("escaped",)
         return {k: v for k, v in super().select_trainable(parameters).items() if not k.startswith(unused)}
 

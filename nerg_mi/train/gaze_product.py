@@ -11,7 +11,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from nerg_mi.errors import NergError, parameter
+from nerg_mi.errors import NergError
 from nerg_mi.fields.encoding import HashGrid, HashGridConfig, encode_direction
 from nerg_mi.fields.gaze_product import GazeConfig, ProductHead, activate
 from nerg_mi.fields.mlp import MLP, stack, unstack
@@ -105,8 +105,7 @@ class ProductTrainer(GazeTrainer):
 
     @classmethod
     def init_from_radiance(cls, radiance: RadianceNetwork, config: GazeConfig) -> tuple[GazeConfig, dict]:
-        config = match_trunk_config(config, radiance.config)
-        return config, extract_initial_weights(radiance, config)
+        return match_trunk_config(config, radiance.config), extract_initial_weights(radiance)
 
     @classmethod
     def configure_features(cls, radiance: RadianceNetwork, config: GazeConfig) -> GazeConfig:
@@ -161,17 +160,8 @@ def match_trunk_config(config: GazeConfig, radiance: RadianceConfig) -> GazeConf
     )
 
 
-def extract_initial_weights(field: RadianceNetwork, config: GazeConfig) -> dict:
-    """Return the grid and position network of ``field`` under the parameter names of a gaze field.
-
-    Raises `NergError` if the sizes of ``config`` differ.
-    """
-    like = match_trunk_config(config, field.config)
-    if (config.grid, config.position_sizes) != (like.grid, like.position_sizes):
-        raise NergError(
-            "a gaze field initialised from a radiance field must have its grid and network sizes; leave out "
-            f"{parameter('size')}"
-        )
+def extract_initial_weights(field: RadianceNetwork) -> dict:
+    """Return the grid and position network of ``field`` under the parameter names of a gaze field."""
     weights = [dr.detach(w) for w in field.density_net.weights]
     # Drop the first output, which is the log density.
     weights[-1] = weights[-1][1:, :]

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -304,13 +304,6 @@ def round_scores(scores: Scores) -> dict[str, float]:
 # batches from the targets.
 
 
-class TrainedGaze(NamedTuple):
-    """Result of a training: the field and its provenance (JSON)."""
-
-    field: GazeHead
-    provenance: dict
-
-
 def fit_gaze(
     supervision: Supervision,
     geometry: Environment,
@@ -320,7 +313,7 @@ def fit_gaze(
     state: StateSettings | None = None,
     on_progress: ProgressCallback | None = None,
     write: Callable[[GazeHead, dict], None] | None = None,
-) -> TrainedGaze:
+) -> tuple[GazeHead, dict]:
     """Train a gaze field.
 
     Parameters
@@ -343,8 +336,10 @@ def fit_gaze(
 
     Returns
     -------
-    TrainedGaze
-        Field and provenance.
+    field : GazeHead
+        Field.
+    provenance : dict
+        Its provenance (JSON).
 
     Raises
     ------
@@ -378,16 +373,17 @@ def fit_gaze(
     # Split the data, and make the targets.
     started = time.perf_counter()
     progress.start(0.0)(GazeProgress("probes", 0.0, 0, 0.0, None))
-    settings, requirements = plan.settings, TargetRequirements.from_config(plan.config)
-    split, validation = split_validation(supervision, geometry, settings, plan.probes), None
+    settings, validation = plan.settings, None
+    split = split_validation(supervision, geometry, settings, plan.probes)
     if split.validation is not None:
-        validation = make_targets(split.validation, geometry, plan, requirements, settings.seed + 2, split.centres)
+        validation = make_targets(split.validation, geometry, plan, settings.seed + 2, split.centres)
     needs_refit = settings.refit and validation is not None
-    selects_weight = selects_prior_weight(plan) and supervision.rays is not None
-    fold_cost = fold_cost if selects_weight and selection is None else 0.0
+    selects_weight = selects_prior_weight(plan, supervision.rays)
+    needs_folds = selects_weight and selection is None
+    fold_cost = fold_cost if needs_folds else 0.0
     is_refit = file.stage == "refit"
     training = supervision if is_refit else split.training
-    targets = make_targets(training, geometry, plan, requirements, settings.seed)
+    targets = make_targets(training, geometry, plan, settings.seed)
 
     # Fit with validation, then again on all data for the best number of steps.
     preparation_seconds = 0.0
@@ -402,7 +398,7 @@ def fit_gaze(
         if is_refit:
             # Save first, because making the targets of all data may take long.
             file.save("refit", None, first.to_dict(), {}, force=True)
-            training, targets = supervision, make_targets(supervision, geometry, plan, requirements, settings.seed)
+            training, targets = supervision, make_targets(supervision, geometry, plan, settings.seed)
     last = first
     if is_refit:
         # Relative to the first fit, which has usually ended before its last step.
@@ -418,7 +414,7 @@ def fit_gaze(
 
     # Select the prior.
     interrupted = is_fit_interrupted
-    if selects_weight and selection is None and not interrupted:
+    if needs_folds and not interrupted:
         try:
             selection = evaluate_folds(supervision, geometry, plan, ns, progress.start(fold_cost)).select()
         except KeyboardInterrupt:
@@ -460,27 +456,23 @@ def fit_gaze(
     if write is not None:
         with saving_on_failure(state.path, save, is_done=not interrupted):
             write(field, provenance)
-    return TrainedGaze(field, provenance)
+    return field, provenance
 
 
 def make_targets(
-    supervision: Supervision,
-    geometry: Environment,
-    plan: GazePlan,
-    requirements: TargetRequirements,
-    seed: int,
-    centres: np.ndarray | None = None,
+    supervision: Supervision, geometry: Environment, plan: GazePlan, seed: int, centres: np.ndarray | None = None
 ) -> GazeTargets:
     """Make targets of the rays and views of ``supervision``.
 
     ``centres`` (T, 3) are the probe positions in the frame of the rays; None: as placed by the plan.
     """
     rays, views, probes = supervision.rays, supervision.views, plan.probes
+    requirements = TargetRequirements.from_config(plan.config)
     if rays is None:
         return make_targets_from_views(views, geometry, probes, requirements, seed)
     targets = make_targets_from_rays(rays, geometry, probes, requirements, centres, seed)
     if not views:
         return targets
     # The prior is estimated from the rays.
-    requirements = TargetRequirements(requirements.semantic, requirements.fill_misses)
+    requirements = replace(requirements, prior_rows=0)
     return concatenate_targets(targets, make_targets_from_views(views, geometry, probes, requirements, seed))

@@ -46,14 +46,7 @@ class GazeLoss(NamedTuple):
 
 
 def compute_gaze_loss(
-    prediction: Any,
-    truth: Any,
-    directions: int,
-    solid_angle: Any = None,
-    *,
-    kld: float = 1.0,
-    cc: float = 1.0,
-    mae: float = 1.0,
+    prediction: Any, truth: Any, directions: int, *, kld: float = 1.0, cc: float = 1.0, mae: float = 1.0
 ) -> GazeLoss:
     """Compute kld · KLD + cc · (1 - CC) + mae · MAE, averaged over the probes.
 
@@ -65,9 +58,7 @@ def compute_gaze_loss(
     prediction, truth : Float
         Densities (P * D,) in 1/sr. Gradients only reach the prediction.
     directions : int
-        Number D of directions per probe.
-    solid_angle : Float, optional
-        Solid angles (D,) common to all probes, or (P * D,). Default: equal.
+        Number D of directions per probe, of equal solid angle.
     kld, cc, mae : float
         Weights of the terms. `gaze_settings.LOSSES` has those of each loss, such as ``**LOSSES["paper"]``.
 
@@ -84,7 +75,7 @@ def compute_gaze_loss(
             f"{dr.width(prediction)} predictions, {n} true densities and {directions} directions per probe do not "
             "match: both must be flat arrays with all directions of each probe in turn"
         )
-    w = _normalise_solid_angles(type(truth), directions, n, solid_angle)
+    w = type(truth)(1.0 / directions)
     truth = dr.detach(truth)
 
     parts: dict[str, Any] = {"kld": None, "cc": None, "mae": None}
@@ -139,19 +130,6 @@ def _center(values: Any, directions: int, w: Any) -> tuple[Any, Any]:
     centred = values - dr.repeat(mean, directions)
     variance = dr.block_sum(w * centred * centred, directions)
     return centred, dr.select(variance > dr.square(MIN_RELATIVE_SPREAD * dr.detach(mean)), variance, 0)
-
-
-def _normalise_solid_angles(Float: type, directions: int, n: int, solid_angle: Any) -> Any:
-    if solid_angle is None:
-        return Float(1.0 / directions)
-    w = Float(solid_angle)
-    if dr.width(w) not in (directions, n):
-        raise ValueError(
-            f"got {dr.width(w)} solid angles for {directions} directions; pass one per direction or one per value"
-        )
-    if dr.width(w) != n:
-        w = dr.tile(w, n // directions)
-    return w / dr.repeat(dr.block_sum(w, directions), directions)
 
 
 # ---- Trainer of a gaze field (NeRG, Section 4.3): base class of all kinds ----
@@ -289,12 +267,12 @@ class GazeTrainer(Trainer):
         # overrun.
         dr.sync_thread()
 
-    def evaluate(self, targets: GazeTargets, weights: dict | None = None) -> Scores:
-        """Score the averaged weights (or ``weights``) on other targets, in all of their directions."""
+    def evaluate(self, targets: GazeTargets) -> Scores:
+        """Score the averaged weights on other targets, in all of their directions."""
         rows = []
         with dr.suspend_grad():
             for batch in self.iter_batches(targets):
-                density = self.evaluate_density(batch, {**self.constant, **(weights or self.averaged)})
+                density = self.evaluate_density(batch, {**self.constant, **self.averaged})
                 if mix := self.config.mix:
                     # The prior weight applies on the sphere. For a view it is applied within the view, because the
                     # field's integral outside is unknown.

@@ -328,7 +328,7 @@ def test04_a_resumed_run_keeps_its_selection(members, tmp_path, rgb, monkeypatch
         with pytest.raises(KeyboardInterrupt):
             trained(state=state, on_progress=stop)
     else:
-        assert trained(state=state, on_progress=stop).provenance["interrupted"]
+        assert trained(state=state, on_progress=stop)[1]["interrupted"]
     selected = read_checkpoint(path, KIND)[1]["about"][SELECTION_KEY]
     # Folds are not evaluated again.
     monkeypatch.setattr("nerg_mi.train.gaze_folds.evaluate_folds", None)
@@ -349,7 +349,7 @@ def test04_a_resumed_run_keeps_its_selection(members, tmp_path, rgb, monkeypatch
         with pytest.raises(NergError, match="run state.*start again"):
             trained(state=replace(state, resume=True))
     write_checkpoint(path, KIND, tensors, meta)
-    provenance = trained(state=replace(state, resume=True)).provenance
+    _, provenance = trained(state=replace(state, resume=True))
     assert not provenance["interrupted"] and provenance["mix"] == selected
     with pytest.raises(NergError, match="cannot resume"):
         fit_gaze(supervision, NOWHERE, plan, ns, state=StateSettings(path=tmp_path / "b.run", resume=True))

@@ -14,7 +14,6 @@ from nerg_mi.errors import NergError
 from nerg_mi.evaluation import metrics
 from nerg_mi.fields.gaze_product import GazeConfig, ProductHead
 from nerg_mi.fields.mlp import namespace
-from nerg_mi.maths.sphere import latlong_grid
 from nerg_mi.train.gaze_product import make_gaze_config
 from nerg_mi.train.gaze_recipes import DEFAULT_RECIPE, FieldOptions, get_recipe, load_recipes, register_recipe
 from nerg_mi.train.gaze_settings import CODE, LOSSES, PAPER, GazeSettings
@@ -26,7 +25,6 @@ from .looks import BOX, NOWHERE
 # ---- Losses ----
 
 P, D = 5, 128
-W = latlong_grid(16, 8)[1]
 
 
 @pytest.fixture
@@ -37,24 +35,22 @@ def densities():
     return truth, guess
 
 
-def loss(Float, guess, truth, w=W, **weights):
-    return compute_gaze_loss(Float(guess.ravel()), Float(truth.ravel()), D, None if w is None else Float(w), **weights)
+def loss(Float, guess, truth, **weights):
+    return compute_gaze_loss(Float(guess.ravel()), Float(truth.ravel()), D, **weights)
 
 
-@pytest.mark.parametrize("w", [W, np.tile(W, P), None], ids=["shared", "own", "equal"])
-def test_agrees_with_the_metrics(densities, w):
+def test_agrees_with_the_metrics(densities):
     truth, guess = densities
-    got = loss(ns.Float64, guess, truth, w, **PAPER)
-    shared = None if w is None else W
+    got = loss(ns.Float64, guess, truth, **PAPER)
     want = {
-        "kld": metrics.kld(truth, guess, shared, eps=KLD_EPS).mean(),
-        "cc": metrics.cc(truth, guess, shared).mean(),
-        "mae": metrics.mae(truth, guess, shared).mean(),
+        "kld": metrics.kld(truth, guess, eps=KLD_EPS).mean(),
+        "cc": metrics.cc(truth, guess).mean(),
+        "mae": metrics.mae(truth, guess).mean(),
     }
     for name, value in want.items():
         assert np.isclose(getattr(got, name)[0], value, rtol=1e-10)
     assert np.isclose(got.total[0], want["kld"] + 1 - want["cc"] + want["mae"], rtol=1e-10)
-    code = loss(ns.Float64, guess, truth, w, **CODE)
+    code = loss(ns.Float64, guess, truth, **CODE)
     assert code.kld is None and np.isclose(code.total[0], want["mae"] + 0.1 * (1 - want["cc"]), rtol=1e-10)
 
 
@@ -63,7 +59,7 @@ def test_gradient_is_that_of_finite_differences(densities, weights):
     truth, guess = densities
     x = ns.Float64(guess.ravel())
     dr.enable_grad(x)
-    dr.backward(compute_gaze_loss(x, ns.Float64(truth.ravel()), D, ns.Float64(W), **weights).total)
+    dr.backward(compute_gaze_loss(x, ns.Float64(truth.ravel()), D, **weights).total)
     slope = np.array(x.grad).reshape(P, D)
     h = 1e-5
     for p, d in [(0, 3), (1, 50), (2, 127), (4, 9)]:
@@ -83,7 +79,7 @@ def test_constants_give_numbers(densities, value, Float):
     for target in (truth, np.zeros_like(truth)):
         x = Float(np.full(P * D, value))
         dr.enable_grad(x)
-        got = compute_gaze_loss(x, Float(target.ravel()), D, Float(W))
+        got = compute_gaze_loss(x, Float(target.ravel()), D)
         dr.backward(got.total)
         assert all(np.isfinite(v[0]) for v in got) and np.isfinite(np.array(x.grad)).all()
         assert got.cc[0] == 0
@@ -99,10 +95,10 @@ def test_negative_predictions_count_as_zero_in_the_divergence(densities, Float):
     assert (guess < 0).any(axis=1).all() and (guess > 0).any(axis=1)[:3].all()
     x = Float(guess.ravel())
     dr.enable_grad(x)
-    got = compute_gaze_loss(x, Float(truth.ravel()), D, Float(W), kld=1, cc=0, mae=0)
+    got = compute_gaze_loss(x, Float(truth.ravel()), D, kld=1, cc=0, mae=0)
     dr.backward(got.total)
     clamped = np.maximum(guess, 0)
-    assert np.isclose(got.kld[0], metrics.kld(truth, clamped, W, eps=KLD_EPS).mean(), rtol=1e-5)
+    assert np.isclose(got.kld[0], metrics.kld(truth, clamped, eps=KLD_EPS).mean(), rtol=1e-5)
     slope = np.array(x.grad).reshape(P, D)
     assert np.isfinite(slope).all() and not slope[guess < 0].any() and slope[0][guess[0] > 0].all()
 
@@ -111,8 +107,6 @@ def test_refusals():
     x = ns.Float(np.ones(12))
     with pytest.raises(ValueError, match="do not match"):
         compute_gaze_loss(x, x, 5)
-    with pytest.raises(ValueError, match="solid angles"):
-        compute_gaze_loss(x, x, 4, ns.Float(1, 2))
     with pytest.raises(ValueError, match="all weights"):
         compute_gaze_loss(x, x, 4, kld=0, cc=0, mae=0)
 

@@ -16,7 +16,7 @@ from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.tracking.probes import place_probes
 from nerg_mi.tracking.rays import Rays
-from nerg_mi.train.gaze_data import Supervision, TargetRequirements, make_targets_from_probes, make_targets_from_rays
+from nerg_mi.train.gaze_data import Supervision, make_targets_from_probes, make_targets_from_rays
 from nerg_mi.train.gaze_product import ProductTrainer
 from nerg_mi.train.gaze_run import GazeRunFile, fit_with_validation, make_targets, refit
 from nerg_mi.train.gaze_settings import GazeSettings
@@ -439,10 +439,9 @@ def test_directions_are_fresh_in_every_epoch(wall, monkeypatch):
 
 
 def test_prior_of_rays_and_views_is_that_of_the_rays():
-    needs = TargetRequirements(prior_rows=8)
     plan, views = planned(LOG, LIKELIHOOD), around(4)
-    rays = make_targets(Supervision(RAYS), NOWHERE, plan, needs, 3)
-    both = make_targets(Supervision(RAYS, views), NOWHERE, plan, needs, 3)
-    alone = make_targets(Supervision(None, views), NOWHERE, plan, needs, 3)
+    rays = make_targets(Supervision(RAYS), NOWHERE, plan, 3)
+    both = make_targets(Supervision(RAYS, views), NOWHERE, plan, 3)
+    alone = make_targets(Supervision(None, views), NOWHERE, plan, 3)
     np.testing.assert_array_equal(both.prior_table, rays.prior_table)
     assert np.abs(alone.prior_table - rays.prior_table).max() > 0.1 and len(both.truth) == len(rays.truth) + 4
