@@ -40,10 +40,10 @@ import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and
 from nerg_mi.alignment.constraints import AlignmentTarget, Evidence, SceneTraces, read_surface, trace_scene
 from nerg_mi.alignment.icp import Twin
 from nerg_mi.alignment.points import Cameras, Pairs
-from nerg_mi.alignment.similarity import MIRROR, residual_distances, transform_points, turn_between
+from nerg_mi.alignment.similarity import MIRROR, residual_distances, turn_between
 from nerg_mi.alignment.tracking import Tracking
 from nerg_mi.errors import NergError
-from nerg_mi.maths.transforms import similarity_scale
+from nerg_mi.maths.transforms import similarity_scale, transform_points
 from nerg_mi.tracking.rays import Rays, merge_rays
 from timing import save_result
 

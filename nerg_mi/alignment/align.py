@@ -16,6 +16,7 @@ from nerg_mi.files.atomic import check_writable, file_sha256
 from nerg_mi.files.values import FilePath, to_path
 from nerg_mi.formats.alignments import Alignment, read_similarity
 from nerg_mi.maths.geometry import Similarity
+from nerg_mi.maths.transforms import transform_points
 from nerg_mi.options import parse_point
 from nerg_mi.photos.colmap import rotation_to_z
 from nerg_mi.photos.photo_set import Photos
@@ -28,7 +29,6 @@ from .check import check_alignment, record_fit
 from .constraints import AlignmentFit, AlignmentTarget, Evidence, read_surface, trace_scene
 from .icp import Twin
 from .points import read_cameras, read_pairs
-from .similarity import transform_points
 from .tracking import Tracking, compare_flips
 
 MAX_IN_SOLIDS = 0.5  # maximum share of heads that are more than 10 cm inside solid objects

@@ -11,7 +11,7 @@ import numpy as np
 from nerg_mi.formats.alignments import Alignment
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.maths.transforms import similarity_scale
+from nerg_mi.maths.transforms import similarity_scale, transform_points
 from nerg_mi.tracking.direction_checks import compute_hit_fractions, describe_mirroring
 from nerg_mi.tracking.rays import Rays
 from nerg_mi.transport.geometry import SURFACE_OPACITY, SceneGeometry, trace_depth
@@ -19,7 +19,6 @@ from nerg_mi.transport.medium import Medium
 
 from .constraints import AlignmentFit
 from .profile import LEVEL
-from .similarity import transform_points
 
 # ---- Check ----
 #

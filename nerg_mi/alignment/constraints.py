@@ -17,13 +17,13 @@ from nerg_mi.formats.alignments import Interval
 from nerg_mi.formats.meshes import READERS, read_mesh_file
 from nerg_mi.maths.coordinates import check_coordinates, check_near_origin
 from nerg_mi.maths.sphere import sample_uniform_directions
-from nerg_mi.maths.transforms import similarity_scale
+from nerg_mi.maths.transforms import similarity_scale, transform_points
 from nerg_mi.photos.posed import read_semidense
 from nerg_mi.tracking.readers.tables import iterate_table, read_table_columns
 from nerg_mi.transport.geometry import SURFACE_OPACITY, SceneGeometry, trace_depth
 from nerg_mi.transport.medium import Medium
 
-from .similarity import FULL_BASIS, LocalSimilarity, transform_points, vertical_rotation
+from .similarity import FULL_BASIS, LocalSimilarity, vertical_rotation
 
 # ---- Distance grid ----
 

@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from nerg_mi.errors import NergError, parameter
-from nerg_mi.maths.transforms import similarity_scale
+from nerg_mi.maths.transforms import similarity_scale, transform_points
 
 from .constraints import (
     AlignmentFit,
@@ -27,7 +27,7 @@ from .constraints import (
     pair_covariance,
     surface_from_points,
 )
-from .similarity import MIRROR, LocalSimilarity, fit_similarity, transform_points, vertical_rotation
+from .similarity import MIRROR, LocalSimilarity, fit_similarity, vertical_rotation
 
 # ---- Scores ----
 #

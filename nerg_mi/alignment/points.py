@@ -13,6 +13,7 @@ from nerg_mi.errors import NergError, parameter, sanitize
 from nerg_mi.files.safe_read import check_regular_file, read_json, translate_read_errors
 from nerg_mi.files.schema import NUMBER, Items, check_json
 from nerg_mi.files.values import FilePath
+from nerg_mi.maths.transforms import transform_points
 from nerg_mi.photos.photo_set import Photos
 from nerg_mi.photos.posed import describe_unused
 from nerg_mi.tracking.readers.columns import open_named_table
@@ -33,7 +34,6 @@ from .similarity import (
     is_planar,
     leave_one_out_distances,
     residual_distances,
-    transform_points,
 )
 
 # ---- Cameras ----

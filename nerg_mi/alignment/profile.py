@@ -15,11 +15,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from nerg_mi.formats.alignments import Interval
-from nerg_mi.maths.transforms import similarity_scale
+from nerg_mi.maths.transforms import similarity_scale, transform_points
 
 from .constraints import AlignmentTarget
 from .icp import Score, refine
-from .similarity import FULL_BASIS, LOG_SCALE, TURN, LocalSimilarity, transform_points, turn_between
+from .similarity import FULL_BASIS, LOG_SCALE, TURN, LocalSimilarity, turn_between
 
 LEVEL = 0.95
 """Level of the intervals: a placement is retained unless its objective exceeds the margin in this fraction of the

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from nerg_mi.errors import NergError, parameter
 from nerg_mi.maths.coordinates import check_coordinates
-from nerg_mi.maths.transforms import similarity_scale
+from nerg_mi.maths.transforms import similarity_scale, transform_points
 
 # ---- Closed-form fit ----
 #
@@ -98,11 +98,6 @@ def vertical_rotation(angle: float) -> np.ndarray:
     """Return the rotation (3, 3) about z by ``angle`` in radians, anticlockwise as seen from above."""
     cos, sin = np.cos(angle), np.sin(angle)
     return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-
-
-def transform_points(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Transform ``points`` (..., 3) by a matrix (4, 4)."""
-    return points @ matrix[:3, :3].T + matrix[:3, 3]
 
 
 def turn_between(a: np.ndarray, b: np.ndarray) -> float:

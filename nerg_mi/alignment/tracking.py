@@ -11,14 +11,14 @@ from scipy import fft
 from scipy.stats import wilcoxon
 
 from nerg_mi.errors import NergError, parameter
-from nerg_mi.maths.transforms import similarity_scale
+from nerg_mi.maths.transforms import similarity_scale, transform_points
 from nerg_mi.tracking.direction_checks import AXIS_SWAPS, DECLARED, compute_head_frames
 from nerg_mi.tracking.rays import Rays
 
 from .constraints import AlignmentFit, AlignmentTarget, ProgressCallback, SceneSurface
 from .icp import GazeEnds, HeadHeight, RefinedAlignment, Score, ZeroDistance, independent_groups, refine
 from .profile import Profile, evaluate_by_group, make_profile
-from .similarity import MIRROR, transform_points, vertical_rotation
+from .similarity import MIRROR, vertical_rotation
 
 # ---- Flipped axes ----
 #

@@ -20,6 +20,7 @@ from nerg_mi.formats.meshes import read_mesh_file, with_shading_normals
 from nerg_mi.formats.splats import read_splats, write_ply_splats
 from nerg_mi.formats.surfaces import write_volume
 from nerg_mi.maths.geometry import AnyBox, Box, Similarity
+from nerg_mi.maths.transforms import transform_points
 from nerg_mi.progress import WarningReporter
 from nerg_mi.tracking.rays import Rays
 from nerg_mi.transport.field_medium import FieldMedium
@@ -253,7 +254,7 @@ class Environment:
 
     def points_to_field(self, points: np.ndarray) -> np.ndarray:
         """Transform points (..., 3) from the frame of the rays to that of the field."""
-        return points @ self.align.matrix[:3, :3].T + self.align.matrix[:3, 3]
+        return transform_points(self.align.matrix, points)
 
     def directions_to_field(self, directions: np.ndarray) -> np.ndarray:
         """Transform unit directions (..., 3) from the frame of the rays to that of the field."""

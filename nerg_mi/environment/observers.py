@@ -11,6 +11,7 @@ from nerg_mi.errors import NergError, parameter
 from nerg_mi.fields.gaze_base import RaySupport
 from nerg_mi.files.values import find_names
 from nerg_mi.maths.geometry import Similarity
+from nerg_mi.maths.transforms import transform_points
 from nerg_mi.progress import Reporter
 from nerg_mi.tracking.rays import Rays
 
@@ -191,7 +192,7 @@ def support_of_rays(rays: Rays) -> RaySupport:
 
 def to_scene_frame(points: np.ndarray, align: Similarity) -> np.ndarray:
     """Transform points (..., 3) from the frame of the rays to that of the scene."""
-    return np.asarray(points, float) @ align.matrix[:3, :3].T + align.matrix[:3, 3]
+    return transform_points(align.matrix, np.asarray(points, float))
 
 
 def _find_person_rows(rays: Rays, person: str) -> np.ndarray:

@@ -16,6 +16,7 @@ from nerg_mi.fields.kde import SphericalKde
 from nerg_mi.maths.arrays import to_vector
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.maths.transforms import transform_points
 from nerg_mi.maths.types import variant_types
 from nerg_mi.tracking.filters import purge, split_by_person
 from nerg_mi.tracking.folds import sample_participants_equally
@@ -98,7 +99,7 @@ class FieldDensity:
     def members(self, positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Evaluate the densities of each member of an ensemble (M, P, D); M is 1 for a single field."""
         align = self._align
-        positions = np.atleast_2d(np.asarray(positions, np.float64)) @ align.matrix[:3, :3].T + align.matrix[:3, 3]
+        positions = transform_points(align.matrix, np.atleast_2d(np.asarray(positions, np.float64)))
         directions = np.asarray(directions, np.float64) @ (align.matrix[:3, :3] / align.scale).T
         directions = np.broadcast_to(directions, (len(positions), *directions.shape[-2:]))
         if directions.shape[1] == 1:
@@ -113,9 +114,9 @@ class FieldDensity:
 
         ``tolerance`` is the relative error of the integral at each origin, which is not cached.
         """
-        matrix = self._align.matrix[:3, :3]
-        origins = np.asarray(origins, np.float64) @ matrix.T + self._align.matrix[:3, 3]
-        directions = np.asarray(directions, np.float64) @ (matrix / self._align.scale).T
+        align = self._align
+        origins = transform_points(align.matrix, np.asarray(origins, np.float64))
+        directions = np.asarray(directions, np.float64) @ (align.matrix[:3, :3] / align.scale).T
         settings = replace(self._settings, integral_tolerance=tolerance)
         return evaluate_densities(self._gaze, self._environment, settings, origins, directions).mean(axis=0)
 

@@ -1,4 +1,4 @@
-"""Checks of rigid and similarity transforms given as matrices."""
+"""Rigid and similarity transforms given as matrices: checks, corrections, and their points."""
 
 from __future__ import annotations
 
@@ -94,6 +94,11 @@ def rotation_errors(linear: np.ndarray, *, may_scale: bool = False, may_mirror: 
             R = R / np.cbrt(determinant)[:, None, None]
         errors = np.abs(np.einsum("nij,nkj->nik", R, R) - np.eye(3)).max(axis=(1, 2))
     return np.where(determinant > 0, errors, np.inf)
+
+
+def transform_points(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Transform ``points`` (..., 3) by a matrix (4, 4)."""
+    return points @ matrix[:3, :3].T + matrix[:3, 3]
 
 
 def nearest_rotation(linear: np.ndarray) -> np.ndarray:

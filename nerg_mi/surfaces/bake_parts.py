@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.alignment.similarity import transform_points
 from nerg_mi.environment.environment import Environment
 from nerg_mi.environment.gaze import GazeField, read_training_alignment
 from nerg_mi.environment.planned import PlannedFiles
@@ -27,6 +26,7 @@ from nerg_mi.formats.alignments import open_similarity
 from nerg_mi.interruption import Interruption
 from nerg_mi.maths.coordinates import check_coordinates
 from nerg_mi.maths.geometry import Similarity
+from nerg_mi.maths.transforms import transform_points
 from nerg_mi.progress import Reporter
 from nerg_mi.ranges import POSITIVE_VALUES
 from nerg_mi.tasks.engines import TaskOutput

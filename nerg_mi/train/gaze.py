@@ -23,6 +23,7 @@ from nerg_mi.formats.alignments import AnySimilarity, open_similarity
 from nerg_mi.formats.fields import save_gaze
 from nerg_mi.interruption import TrainingInterrupted
 from nerg_mi.maths.geometry import Similarity
+from nerg_mi.maths.transforms import transform_points
 from nerg_mi.photos.salience import SalienceView, open_salience
 from nerg_mi.progress import SILENT, Progress, Reporter, open_reporter
 from nerg_mi.ranges import (
@@ -408,7 +409,7 @@ def _leave_out_views(
         f"{len(test['centres'])} test positions and {participants} participant{'' if participants == 1 else 's'} held "
         f"out, {test['rays_to_train']:,} of {test['rays']:,} rays remain for training"
     )
-    centres = np.array(test["centres"]) @ to_scene.matrix[:3, :3].T + to_scene.matrix[:3, 3]
+    centres = transform_points(to_scene.matrix, np.array(test["centres"]))
     return tuple(select_far_views(views, centres, distance * to_scene.scale))
 
 

@@ -9,17 +9,11 @@ from nerg_mi.alignment import profile
 from nerg_mi.alignment.constraints import AlignmentTarget
 from nerg_mi.alignment.icp import ZeroDistance, refine
 from nerg_mi.alignment.profile import TURN, Profile, evaluate_by_group, find_arc
-from nerg_mi.alignment.similarity import (
-    LocalSimilarity,
-    residual_distances,
-    transform_points,
-    turn_between,
-    vertical_rotation,
-)
+from nerg_mi.alignment.similarity import LocalSimilarity, residual_distances, turn_between, vertical_rotation
 from nerg_mi.alignment.tracking import Tracking
 from nerg_mi.errors import NergError
 from nerg_mi.formats.alignments import Interval
-from nerg_mi.maths.transforms import similarity_scale
+from nerg_mi.maths.transforms import similarity_scale, transform_points
 from tests.alignment import rooms
 
 RAYS = replace(rooms.people(200), hit=None)
