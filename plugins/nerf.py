@@ -33,10 +33,10 @@ Radiance field (:monosp:`nerf`)
    - Features of the grid and weight matrices of both networks.
    - |exposed|, |differentiable|
 
- * - voxels.log_density
+ * - voxels.log_density, voxels.color_basis
    - |tensor|
-   - Log densities of a compiled field (``nerg compile``), which replace the density of its networks. They are discarded
-     when the grid or a network changes.
+   - Log densities of a compiled field (``nerg compile``), which replace the density of its networks, and the functions
+     of the direction of its stored colours. They are discarded when the grid or a network changes.
    - |exposed|, |differentiable|
 
 Density and view-dependent colour of a scene: a multiresolution hash grid with two small networks. The colour network is
@@ -122,8 +122,10 @@ class NerfVolume(make_volume_class()):
 
     def parameters_changed(self, keys=()):
         # Mitsuba passes the last part of each name only, by which the networks cannot be told apart.
-        if set(keys) != {"log_density"}:
+        if not set(keys) or set(keys) - {"log_density", "color_basis"}:
             super().parameters_changed(keys)
+        elif "color_basis" in keys:
+            self.field.voxels.colors.net.pack()
 
     def resolution(self):
         cells = int(self.field.config.grid.finest)

@@ -427,7 +427,7 @@ TABLE = (
         ("field",),
         "Compiled radiance field to write (.safetensors).",
         (".safetensors",),
-        without=("max_depth_error", "min_psnr", "memory"),
+        without=("max_depth_error", "memory"),
     ),
     Row(
         "bake",

@@ -1,7 +1,9 @@
-"""Voxels of a compiled field: its log density on the vertices of blocks near surfaces, and where these are."""
+"""Voxels of a compiled field: its log density on the vertices of blocks near surfaces, where these are, and their
+colours."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any, ClassVar
@@ -12,6 +14,8 @@ import numpy as np
 from nerg_mi.maths.arrays import copy_aligned
 from nerg_mi.maths.types import Array3f, Bool, Float, UInt32
 
+from .encoding import encode_direction
+from .mlp import MLP
 from .occupancy import chessboard_distance
 
 # The unit cube has R³ cells, in blocks of 8³. A block with matter stores the log density on its 9³ vertices in half
@@ -25,6 +29,77 @@ _PART_EDGE = 4  # Cells along an edge of the parts between which distances are s
 _EMPTY = 0xFFFFFFFF
 MAX_RESOLUTION = 2048
 """Maximum number of cells along an edge; tables of all blocks and parts then take 190 MB."""
+
+
+# ---- Colours ----
+#
+# Colour is linear in a few numbers q of a point, with factors that depend on the direction d:
+#
+#     c(p, d) = B_K(d) + Σ_k q_k(p) B_k(d)
+#
+# B is a matrix times the spherical harmonics of d, one for all points; q are bytes, trilinear between the vertices of a
+# lattice in each block. Sums along a ray are those of q, so B is evaluated once per ray.
+
+COLOR_NUMBERS = 8  # Bytes of a vertex
+LATTICE_EDGES = (8, 4, 2)
+"""Cells of the lattice of colours along an edge of a block, from the finest."""
+
+
+class VoxelColors:
+    """Colours of the blocks of a `VoxelGrid`. Raises ``ValueError`` for arrays that do not belong together.
+
+    Parameters
+    ----------
+    edge : int
+        One of `LATTICE_EDGES`.
+    numbers : array
+        The bytes q (uint8, (N, (edge + 1)³, `COLOR_NUMBERS`)), x fastest.
+    basis : array
+        The matrix of B (float32, (3 K + 3, harmonics)): the rows of B_k follow each other, red, green, blue.
+    """
+
+    DRJIT_STRUCT: ClassVar[dict[str, Any]] = {"_words": None, "net": None}
+
+    def __init__(self, edge: int, numbers: np.ndarray, basis: np.ndarray, ns: ModuleType):
+        degree = math.isqrt(basis.shape[1]) if basis.ndim == 2 else 0
+        vertices, outputs = (edge + 1) ** 3, 3 * COLOR_NUMBERS + 3
+        if edge not in LATTICE_EDGES or numbers.shape[1:] != (vertices, COLOR_NUMBERS) or numbers.dtype != np.uint8:
+            raise ValueError(f"colours of a lattice of {edge} have the shape {numbers.shape} and type {numbers.dtype}")
+        if basis.shape != (outputs, degree**2) or not 1 <= degree <= 10 or not np.isfinite(basis).all():
+            raise ValueError(f"the basis of colours must be {outputs} finite rows of harmonics, not {basis.shape}")
+        self._ns, self.edge, self.numbers, self._degree = ns, edge, numbers, degree
+        self._words = ns.Int32(copy_aligned(numbers.reshape(-1).view(np.int32), np.int32))
+        self.net = MLP([ns.TensorXf(copy_aligned(basis))])
+        self.net.pack()
+
+    @property
+    def size(self) -> int:
+        """Bytes of the arrays in a file."""
+        return self.numbers.nbytes + 4 * int(np.prod(self.net.weights[0].shape))
+
+    def interpolate(self, block: UInt32, position: Array3f, active: Bool) -> list[Float]:
+        """The numbers q at a ``position`` (0..1 along each axis) of a ``block``."""
+        ns, edge = self._ns, self.edge + 1
+        position = position * self.edge
+        cell = [ns.UInt32(dr.clip(dr.detach(c), 0, self.edge - 1)) for c in position]
+        x, y, z = ([1 - w, w] for w in (c - ns.Float(k) for c, k in zip(position, cell)))
+        first = block * edge**3 + cell[0] + edge * (cell[1] + edge * cell[2])
+        out = [ns.Float(0)] * COLOR_NUMBERS
+        for k in range(8):
+            i, j, l = k & 1, k >> 1 & 1, k >> 2
+            words = dr.gather(ns.Array2i, self._words, first + (i + edge * (j + edge * l)), active)
+            weight = x[i] * y[j] * z[l]
+            out = [dr.fma(weight, ns.Float((words[n // 4] >> (8 * (n % 4))) & 255), q) for n, q in enumerate(out)]
+        return out
+
+    def decode(self, numbers: list[Float], opacity: Float, d: Array3f) -> list[Float]:
+        """Colour times ``opacity`` along unit ``d``, of the sums Σ w q with the weights of ``opacity`` = Σ w."""
+        b = self.net(encode_direction(d, self._degree))
+        color = [b[-3 + c] * opacity + sum(q * b[3 * k + c] for k, q in enumerate(numbers)) for c in range(3)]
+        return [dr.clip(c, 0, opacity) for c in color]
+
+
+# ---- Density ----
 
 
 @dataclass(frozen=True)
@@ -80,16 +155,26 @@ class VoxelGrid:
         Cells along an edge of the unit cube.
     size : int
         Bytes of the arrays in a file.
+    blocks : array
+        Flat indices (uint32, (N,)) of the blocks.
     log_density : Float16
         The log densities of all blocks: a parameter that can carry gradients.
+    colors : VoxelColors or None
+        Colours, which replace those of the networks.
     """
 
-    DRJIT_STRUCT: ClassVar[dict[str, Any]] = {"log_density": None, "_masks": None, "_index": None, "_distance": None}
+    DRJIT_STRUCT: ClassVar[dict[str, Any]] = {
+        **dict.fromkeys(("log_density", "_masks", "_index", "_distance")),
+        "colors": None,
+    }
 
-    def __init__(self, arrays: VoxelArrays, ns: ModuleType):
+    def __init__(self, arrays: VoxelArrays, ns: ModuleType, colors: VoxelColors | None = None):
+        if colors is not None and len(colors.numbers) != len(arrays.blocks):
+            raise ValueError(f"{len(arrays.blocks)} blocks of voxels have {len(colors.numbers)} blocks of colours")
+        self.colors = colors
         n = arrays.resolution // BLOCK_EDGE
         self._ns, self.resolution, self.size, self._blocks_per_edge = ns, arrays.resolution, arrays.size, n
-        self.cells, self._stored_blocks, self._stored_masks = (arrays.resolution,) * 3, arrays.blocks, arrays.masks
+        self.cells, self.blocks, self._stored_masks = (arrays.resolution,) * 3, arrays.blocks, arrays.masks
         index = np.full(n**3, _EMPTY, np.uint32)
         index[arrays.blocks] = np.arange(len(arrays.blocks), dtype=np.uint32)
         self._index = ns.UInt32(index)
@@ -106,14 +191,14 @@ class VoxelGrid:
         words, half = self._stored_masks.reshape(-1, k, _PART_EDGE, k), np.uint32(0x0F0F0F0F)
         parts = np.stack([(words & half) > 0, (words & ~half) > 0], axis=-1).any(axis=2)
         out = np.zeros((n, k, n, k, n, k), bool)
-        z, y, x = np.unravel_index(self._stored_blocks, (n, n, n))
+        z, y, x = np.unravel_index(self.blocks, (n, n, n))
         out[z, :, y, :, x, :] = parts
         return out.reshape(n * k, n * k, n * k)
 
     def to_arrays(self) -> VoxelArrays:
         """What a file stores, with the current log densities."""
         log_density = self.log_density.numpy().reshape(-1, VERTICES)
-        return VoxelArrays(self.resolution, self._stored_blocks, self._stored_masks, log_density)
+        return VoxelArrays(self.resolution, self.blocks, self._stored_masks, log_density)
 
     @property
     def coarse(self) -> VoxelGrid:
@@ -128,21 +213,27 @@ class VoxelGrid:
 
     def named(self) -> dict[str, Any]:
         """The parameters by name."""
-        return {"log_density": self.log_density}
+        basis = {} if self.colors is None else {"color_basis": self.colors.net.weights[0]}
+        return {"log_density": self.log_density, **basis}
 
     def replace(self, name: str, value: Any) -> None:
         """Replace the parameter ``name`` by ``value`` of the same shape."""
-        setattr(self, name, value)
+        if name == "color_basis" and self.colors is not None:
+            self.colors.net.replace("0", value)
+            self.colors.net.pack()
+        else:
+            setattr(self, name, value)
 
     def kernel_parameters(self) -> list[Any]:
-        """The array that evaluations read, attached to ``log_density``: itself, or with derivatives a copy in single
-        precision, which the sums of gradients need."""
+        """The arrays that evaluations read. The first one is attached to ``log_density``: itself, or with derivatives a
+        copy in single precision, which the sums of gradients need."""
+        basis = [] if self.colors is None else [self.colors.net.buffer]
         if not dr.grad_enabled(self.log_density):
-            return [self.log_density]
+            return [self.log_density, *basis]
         # A loop that is recorded cannot convert an array, so the copy is made before it and kept.
         if self._single is None or self._single[0] != self.log_density.index_ad:
             self._single = self.log_density.index_ad, self._ns.Float(self.log_density)
-        return [self._single[1]]
+        return [self._single[1], *basis]
 
     def _cell(self, u: Array3f) -> list[UInt32]:
         """The cell of points of the unit cube, along each axis; points outside belong to its nearest cell."""
@@ -191,3 +282,12 @@ class VoxelGrid:
             weight = dr.fma(coordinate, self.resolution, -ns.Float(c))
             corners = [dr.lerp(low, high, weight) for low, high in zip(corners[::2], corners[1::2])]
         return corners[0], active
+
+    def color_numbers(self, u: Array3f, active: Bool | bool = True) -> list[Float]:
+        """The numbers of `colors` at ``u`` (unit cube); 0 in blocks without matter."""
+        ns, colors = self._ns, self.colors
+        assert colors is not None
+        cell = self._cell(dr.detach(u))
+        block = self._block(cell, active)
+        corner = ns.Array3f(*(c // BLOCK_EDGE for c in cell))
+        return colors.interpolate(block, u * self._blocks_per_edge - corner, active & (block != _EMPTY))

@@ -27,7 +27,7 @@ from nerg_mi.fields.gaze_hits import HitKernel, ReaimedHits
 from nerg_mi.fields.mlp import MLP
 from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid, RefinedGrid, unpack_bits
 from nerg_mi.fields.radiance import EMPTY, Background, BackgroundConfig, RadianceConfig, RadianceNetwork
-from nerg_mi.fields.voxels import VoxelArrays, VoxelGrid
+from nerg_mi.fields.voxels import VoxelArrays, VoxelColors, VoxelGrid
 from nerg_mi.files.atomic import file_sha256, write_bytes
 from nerg_mi.files.safe_read import describe_error
 from nerg_mi.maths.arrays import copy_aligned
@@ -268,8 +268,12 @@ _VOXEL_ARRAYS = ("blocks", "masks", "log_density")
 
 def encode_voxels(voxels: VoxelGrid) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Convert ``voxels`` to arrays of a checkpoint by name, and its metadata."""
-    arrays = voxels.to_arrays()
-    return {f"voxels.{name}": getattr(arrays, name) for name in _VOXEL_ARRAYS}, {"resolution": voxels.resolution}
+    arrays, config = voxels.to_arrays(), {"resolution": voxels.resolution}
+    tensors = {f"voxels.{name}": getattr(arrays, name) for name in _VOXEL_ARRAYS}
+    if voxels.colors is not None:
+        tensors["voxels.colors"], config["colors"] = voxels.colors.numbers, voxels.colors.edge
+        tensors["voxels.color_basis"] = voxels.colors.net.weights[0].numpy()
+    return tensors, config
 
 
 def _decode_voxels(arrays: StoredArrays, config: dict) -> VoxelGrid:
@@ -277,7 +281,12 @@ def _decode_voxels(arrays: StoredArrays, config: dict) -> VoxelGrid:
     blocks, masks, log_density = (arrays.get_raw(f"voxels.{name}") for name in _VOXEL_ARRAYS)
     if (blocks.dtype, masks.dtype, log_density.dtype) != (np.uint32, np.uint32, np.float16):
         raise ValueError("the arrays of its voxels have other types than uint32 and float16")
-    return VoxelGrid(VoxelArrays(cast("int", resolution), blocks, masks, log_density), arrays.ns)
+    colors = None
+    if "colors" in config:
+        basis = arrays.get_array("voxels.color_basis", None, None)
+        edge = cast("int", read_number(config, "colors", "voxels"))
+        colors = VoxelColors(edge, arrays.get_raw("voxels.colors"), basis, arrays.ns)
+    return VoxelGrid(VoxelArrays(cast("int", resolution), blocks, masks, log_density), arrays.ns, colors)
 
 
 def save_radiance(

@@ -12,14 +12,15 @@ import numpy as np
 
 from nerg_mi.environment.radiance import RadianceField
 from nerg_mi.errors import NergError, parameter
+from nerg_mi.fields.color_fit import fit_colors
 from nerg_mi.fields.compilation import attach_voxels, compile_density
 from nerg_mi.fields.occupancy import refine_occupancy
 from nerg_mi.fields.radiance import RadianceNetwork
-from nerg_mi.fields.voxels import BLOCK_EDGE, MAX_RESOLUTION, VoxelGrid
+from nerg_mi.fields.voxels import BLOCK_EDGE, COLOR_NUMBERS, LATTICE_EDGES, MAX_RESOLUTION, VoxelGrid
 from nerg_mi.files.values import FilePath
 from nerg_mi.maths.arrays import to_vector
 from nerg_mi.maths.types import variant_types
-from nerg_mi.progress import Progress, open_reporter
+from nerg_mi.progress import Progress, Reporter, open_reporter
 from nerg_mi.ranges import LENGTHS, Range, check_ranges
 from nerg_mi.transport.field_medium import FieldMedium, make_color_shader
 from nerg_mi.transport.geometry import SceneGeometry, default_march_settings
@@ -48,21 +49,35 @@ class CompiledError:
     speedup: float
 
 
+@dataclass(frozen=True)
+class StoredColorError:
+    """Differences of stored colours from those of the networks on the same voxels, along the same rays."""
+
+    # Cells of the lattice of colours along an edge of the unit cube of positions.
+    resolution: int
+    # Size of the colours in bytes.
+    size: int
+    # PSNR in dB, compared with the networks on the same voxels.
+    psnr: float
+    # Time of a rendering of colour and depth with the networks, divided by that with the stored colours.
+    speedup: float
+
+
 @check_ranges
 def compile_field(
     field: RadianceField | FilePath,
     *,
     resolution: Annotated[int, Range(0, 2048)] = 0,
     max_depth_error: Annotated[float, LENGTHS] | None = None,
-    min_psnr: Annotated[float, Range(0, 120)] = 40.0,
+    color: bool = False,
+    min_psnr: Annotated[float, Range(0, 120)] = 38.0,
     memory: Annotated[float, Range(1, 16384)] = 300.0,
     progress: Progress = None,
 ) -> RadianceField:
     """Evaluate the density of a radiance field on voxels once, so that frames take about half the time.
 
     The compiled field is compared with the field along random rays, the same for the choice of the resolution and for
-    the errors that are reported. Colour still comes from the networks, and gaze fields that were trained in the field
-    accept the compiled one.
+    the errors that are reported. Gaze fields that were trained in the field accept the compiled one.
 
     Parameters
     ----------
@@ -73,10 +88,14 @@ def compile_field(
         until both errors are below their limits.
     max_depth_error : float, optional
         Maximum median depth error in scene units. Default: a tenth of a march step.
+    color : bool
+        Store colours on the voxels as well, fitted to those of the networks, so that images do not need these. It takes
+        minutes, and up to 5 times the memory. If the stored colours differ from those of the networks on the same
+        voxels by more than ``min_psnr``, colour still comes from the networks.
     min_psnr : float
         Minimum PSNR in dB of the colour, compared with the field itself.
     memory : float
-        Maximum size of the voxels in MB.
+        Maximum size of the voxels and their colours in MB.
     progress : bool, Reporter or None
         Progress and messages (`nerg_mi.progress.Progress`).
 
@@ -84,7 +103,8 @@ def compile_field(
     -------
     RadianceField
         The compiled field. ``provenance["compiled"]`` has its resolution, its size in bytes, its depth errors in scene
-        units, the PSNR of its colour in dB and the speed-up.
+        units, the PSNR of its colour in dB and the speed-up, and ``provenance["stored_color"]`` those of stored
+        colours.
 
     Raises
     ------
@@ -111,7 +131,7 @@ def compile_field(
     resolutions = [resolution] if resolution else _RESOLUTIONS
     rays = _make_rays(network)
     reference, seconds = _render(network, rays)
-    voxels = result = None
+    voxels = result = pixels = None
     with open_reporter(progress) as reporter:
         for k, edge in enumerate(resolutions):
             report = lambda fraction, k=k: reporter.progress((k + fraction) / len(resolutions), "compiling the density")
@@ -141,8 +161,49 @@ def compile_field(
                     f"the aims of {parameter('min_psnr')} ({min_psnr:g} dB) and {parameter('max_depth_error')} "
                     f"({max_depth_error:.2g}) are not reached at the highest resolution"
                 )
-    assert result is not None
-    return result
+        assert result is not None and pixels is not None
+        return _store_colors(result, pixels, rays, memory, min_psnr, reporter) if color else result
+
+
+def _store_colors(
+    compiled: RadianceField,
+    reference: np.ndarray,
+    rays: tuple[np.ndarray, np.ndarray],
+    memory: float,
+    min_psnr: float,
+    reporter: Reporter,
+) -> RadianceField:
+    """The ``compiled`` field with colours on the finest lattice within ``memory`` if they are within ``min_psnr`` of
+    its own, which the ``rays`` have in the ``reference`` (N, 5); else itself, with a warning."""
+    network = copy.copy(compiled.network)
+    voxels = network.voxels = copy.copy(network.voxels)
+    assert voxels is not None
+    sizes = {edge: COLOR_NUMBERS * (edge + 1) ** 3 * len(voxels.blocks) for edge in LATTICE_EDGES}
+    edge = next((edge for edge, size in sizes.items() if voxels.size + size <= 1e6 * memory), None)
+    if edge is None:
+        reporter.warn(
+            f"colours would take {min(sizes.values()) / 1e6:.0f} MB next to voxels of {voxels.size / 1e6:.0f} MB, and "
+            f"are not stored; use a lower resolution or a higher {parameter('memory')} (now {memory:g} MB)"
+        )
+        return compiled
+    colors = fit_colors(network, edge, lambda fraction: reporter.progress(fraction, "fitting the colours"))
+    _, seconds = _render(network, rays)
+    voxels.colors = colors
+    pixels, stored_seconds = _render(network, rays)
+    psnr, resolution = _compute_psnr(reference, pixels), edge * voxels.resolution // BLOCK_EDGE
+    error = StoredColorError(resolution, colors.size, psnr, seconds / stored_seconds)
+    text = (
+        f"colours on {resolution} cells along an edge, {colors.size / 1e6:.0f} MB: {psnr:.1f} dB compared with the "
+        f"networks; {_RAYS:,} rays take {1e3 * stored_seconds:.3g} ms, with the networks {1e3 * seconds:.3g} ms"
+    )
+    if psnr < min_psnr:
+        reporter.warn(
+            f"{text}; the networks are kept, since {parameter('min_psnr')} is {min_psnr:g} dB: use a higher "
+            f"resolution, or more {parameter('memory')}"
+        )
+        return compiled
+    reporter.message(text)
+    return compiled.derive(network, stored_color=asdict(error))
 
 
 def _make_rays(field: RadianceNetwork) -> tuple[Any, Any]:
@@ -187,9 +248,13 @@ def _render(field: RadianceNetwork, rays: tuple[np.ndarray, np.ndarray]) -> tupl
 def _compare(reference: np.ndarray, compiled: np.ndarray, voxels: VoxelGrid, speedup: float) -> CompiledError:
     both = (reference[:, 3] >= 0.5) & (compiled[:, 3] >= 0.5)
     difference = np.abs(reference[both, 4] - compiled[both, 4])
-    mse = float(np.mean((reference[:, :3] - compiled[:, :3]) ** 2, dtype=np.float64))
     median, high = np.quantile(difference, [0.5, 0.99]).tolist() if both.any() else (0.0, 0.0)
-    return CompiledError(voxels.resolution, voxels.size, median, high, -10 * np.log10(max(mse, 1e-12)), speedup)
+    return CompiledError(voxels.resolution, voxels.size, median, high, _compute_psnr(reference, compiled), speedup)
+
+
+def _compute_psnr(reference: np.ndarray, compiled: np.ndarray) -> float:
+    mse = float(np.mean((reference[:, :3] - compiled[:, :3]) ** 2, dtype=np.float64))
+    return float(-10 * np.log10(max(mse, 1e-12)))
 
 
 # ---- Refinement of the occupancy grid ----

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import drjit as dr
 import numpy as np
 
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.fields.radiance import RadianceNetwork, mean_features
+from nerg_mi.fields.voxels import COLOR_NUMBERS, VoxelColors
 from nerg_mi.maths.geometry import Similarity, intersect_box
 from nerg_mi.maths.types import Array3f, Bool, Color, Float, Point3f, Ray3f, Vector3f, variant_types
 
@@ -32,6 +33,8 @@ class FeatureShader:
     ``medium``: a medium with features; ``color_type``: array type of the colour, or None for features alone. Deferred
     shading computes the colour from the composited features; otherwise the colour of the sample precedes its features.
     """
+
+    needs_features = True
 
     def __init__(self, medium: Medium, color_type: type | None = None):
         self.color_type, self.count = color_type, medium.feature_count
@@ -62,8 +65,29 @@ class FeatureShader:
         return list(sums)[3 * self._has_own_color :]
 
 
+class VoxelColorShader:
+    """Contributes the numbers of the stored colours of a compiled field (see `medium.SampleShader`)."""
+
+    needs_features = False
+
+    def __init__(self, colors: VoxelColors, color_type: type):
+        self._colors, self._color_type = colors, color_type
+        self._ns = namespace(colors.net.weights[0])
+
+    def zero(self) -> Any:
+        return self._ns.ArrayXf([self._ns.Float(0)] * COLOR_NUMBERS)
+
+    def shade(self, medium: Medium, features: list[Float], p: Point3f, w: Vector3f, active: Bool) -> Any:
+        return self._ns.ArrayXf(cast("FieldMedium", medium).color_numbers(p, active))
+
+    def resolve_color(self, medium: Medium, sums: Any, opacity: Float, ray: LocalRay, active: Bool) -> Color:
+        return self._color_type(*self._colors.decode(list(sums), opacity, ray.w))
+
+
 def make_color_shader(medium: Medium, color_type: type, with_features: bool = False) -> SampleShader:
     """A shader for the colour of a medium, as ``color_type``; ``with_features``: a `FeatureShader`."""
+    if not with_features and isinstance(medium, FieldMedium) and medium.colors is not None:
+        return VoxelColorShader(medium.colors, color_type)
     return FeatureShader(medium, color_type) if with_features or medium.is_deferred else ColorShader(color_type)
 
 
@@ -131,8 +155,13 @@ class FieldMedium:
         self.color_space = field.color_space
 
     @property
+    def colors(self) -> VoxelColors | None:
+        """The stored colours of a compiled field."""
+        return None if self.field.voxels is None else self.field.voxels.colors
+
+    @property
     def is_deferred(self) -> bool:
-        return self.field.config.deferred
+        return self.field.config.deferred and self.colors is None
 
     @property
     def occupancy(self) -> Occupancy | None:
@@ -199,7 +228,14 @@ class FieldMedium:
         return clamp_density(sigma * self._per_unit), features
 
     def color(self, features: list[Float], p: Point3f, w: Vector3f, active: Bool) -> Color:
-        return self.field.color(features, w)
+        if self.colors is None:
+            return self.field.color(features, w)
+        return type(w)(*self.colors.decode(self.color_numbers(p, active), type(w.x)(1), w))
+
+    def color_numbers(self, p: Point3f, active: Bool) -> list[Float]:
+        """The numbers of the stored colours at local points (`voxels.VoxelGrid.color_numbers`)."""
+        assert self.field.voxels is not None
+        return self.field.voxels.color_numbers(self.field.box.to_unit(p), active & self.field.box.contains(p))
 
     def background(self, o: Point3f, d: Vector3f) -> Color | None:
         """Colour of the field's background network; None for a field without one."""

@@ -370,6 +370,11 @@ def clamp_density(sigma: Float) -> Float:
 class SampleShader(Protocol):
     """The contribution of samples. Sums are arrays that can be added, and scaled by a Float."""
 
+    @property
+    def needs_features(self) -> bool:
+        """Whether ``shade`` uses the features."""
+        ...
+
     def zero(self) -> Color:
         """An empty sum, one lane wide."""
         ...
@@ -396,6 +401,8 @@ class ColorShader:
 
     Not for a medium with deferred shading: see `field_medium.make_color_shader`.
     """
+
+    needs_features = True
 
     def __init__(self, array_type: type):
         self.array_type = array_type

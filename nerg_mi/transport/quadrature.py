@@ -375,7 +375,8 @@ def _step_along_line(
 def shade_point(medium: Medium, ray: LocalRay, distance: Float, shader: SampleShader, active: Bool) -> Color:
     """Contribution of the point at ``distance`` on ``ray``, whose features are evaluated for it alone."""
     p = ray.o + ray.d * distance
-    return shader.shade(medium, medium.density_features(p, active)[1], p, ray.w, active)
+    features = medium.density_features(p, active)[1] if shader.needs_features else []
+    return shader.shade(medium, features, p, ray.w, active)
 
 
 class Constant:
