@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -12,7 +13,7 @@ from scipy.sparse import csr_matrix
 from nerg_mi.maths.arrays import copy_aligned, to_vector
 from nerg_mi.maths.types import Array3f, Float
 
-from .compilation import block_corners
+from .compilation import find_block_corners
 from .encoding import encode_direction
 from .radiance import RadianceNetwork
 from .voxels import BLOCK_EDGE, COLOR_NUMBERS, VoxelColors, VoxelGrid
@@ -36,12 +37,10 @@ _NORMAL = 0.38  # Minimum component of a unit gradient along an axis to which it
 
 
 def fit_colors(
-    field: RadianceNetwork,
-    edge: int,
-    on_progress: Callable[[float], None] = lambda fraction: None,
+    field: RadianceNetwork, edge: int, on_progress: Callable[[float], None] = lambda fraction: None
 ) -> VoxelColors:
-    """Colours of the networks of a compiled ``field`` on the blocks of its voxels, with ``edge`` cells of a lattice along the
-    edge of a block (`voxels.LATTICE_EDGES`). Equal fields give equal colours."""
+    """Colours of the networks of a compiled ``field`` on the blocks of its voxels, with ``edge`` cells of a lattice
+    along the edge of a block (`voxels.LATTICE_EDGES`). Equal fields give equal colours."""
     rng, blocks = np.random.default_rng(0), _get_voxels(field).blocks
     with dr.suspend_grad():
         basis, low, high = _find_basis(field, rng)
@@ -113,11 +112,7 @@ def _make_solvers(factors: np.ndarray, directions: np.ndarray) -> np.ndarray:
 
 
 def _sample_points(
-    field: RadianceNetwork,
-    blocks: np.ndarray,
-    edge: int,
-    directions: np.ndarray,
-    rng: np.random.Generator,
+    field: RadianceNetwork, blocks: np.ndarray, edge: int, directions: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, ...]:
     """Points with matter, spread over the cells of the lattices of ``blocks``.
 
@@ -136,12 +131,12 @@ def _sample_points(
     jitter = to_vector(ns.Array3f, rng.random((len(blocks) * per_block, 3), np.float32))
     position = (ns.Array3f(cell % edge, cell // edge % edge, cell // edge**2) + jitter) / edge
     index = dr.gather(ns.UInt32, ns.UInt32(copy_aligned(blocks, np.uint32)), block)
-    u = (block_corners(index, n, ns) + position) / n
+    u = (find_block_corners(index, n, ns) + position) / n
     weight, inwards = _estimate_visibility(field, resolution, u)
     kind = sum(
         3**axis * (1 + dr.select(c > _NORMAL, 1, 0) - dr.select(c < -_NORMAL, 1, 0)) for axis, c in enumerate(inwards)
     )
-    seen = dr.compress(weight > _MIN_WEIGHT)
+    seen: Any = dr.compress(weight > _MIN_WEIGHT)
     if dr.width(seen) == 0:
         seen = ns.UInt32(0)
     pick = lambda value: dr.gather(type(value), value, seen)
@@ -184,7 +179,9 @@ def _fit_vertices(
     # (N, 8): the vertices of the cell of each point, and their weights.
     shares = np.where(corners, inside[:, None], 1 - inside[:, None]).prod(axis=2).astype(np.float32)
     columns = (cell[:, None] + corners) @ np.array([1, edge + 1, (edge + 1) ** 2]) + block[:, None] * vertices
-    a = csr_matrix((shares.ravel(), columns.ravel(), np.arange(0, 8 * len(block) + 1, 8)), (len(block), count * vertices))
+    a = csr_matrix(
+        (shares.ravel(), columns.ravel(), np.arange(0, 8 * len(block) + 1, 8)), (len(block), count * vertices)
+    )
     weighted = csr_matrix((a.data * np.repeat(weight, 8), a.indices, a.indptr), a.shape).T.tocsr()
     total = weighted @ np.ones(len(block), np.float32)
     # Vertices without points take the mean of their block.

@@ -130,7 +130,7 @@ def _candidate_blocks(field: RadianceNetwork, resolution: int, start: VoxelGrid 
     # Points along an edge of a block, so that each cell of the occupancy grid contains one.
     count = max(1, math.ceil(BLOCK_EDGE * grid.resolution / resolution)) * (2 if field.box.is_contracted else 1)
     index, occupied = dr.arange(ns.UInt32, n**3), dr.zeros(ns.Bool, n**3)
-    corner = block_corners(index, n, ns)
+    corner = find_block_corners(index, n, ns)
     for k in range(count**3):
         offset = ns.Array3f(*[dr.opaque(ns.Float, (k // count**axis % count + 0.5) / count) for axis in range(3)])
         occupied |= _is_occupied(field, (corner + offset) / n)
@@ -150,7 +150,7 @@ def _is_occupied(field: RadianceNetwork, u: Array3f):
     return inside & (field.occupancy.distance_to_occupied(field.box.to_cube(p), inside) == 0)
 
 
-def block_corners(index: UInt32, n: int, ns) -> Array3f:
+def find_block_corners(index: UInt32, n: int, ns) -> Array3f:
     """Lower corners of blocks in blocks, x fastest."""
     z, y = index // (n * n), index // n % n
     return ns.Array3f(index % n, y, z)
@@ -162,7 +162,7 @@ def _evaluate_blocks(field: RadianceNetwork, blocks: np.ndarray, resolution: int
     index = ns.UInt32(copy_aligned(blocks, np.uint32))
     vertex = dr.arange(ns.UInt32, len(blocks) * VERTICES)
     block, v = vertex // VERTICES, vertex % VERTICES
-    corner = block_corners(dr.gather(ns.UInt32, index, block), n, ns) * BLOCK_EDGE
+    corner = find_block_corners(dr.gather(ns.UInt32, index, block), n, ns) * BLOCK_EDGE
     u = (corner + ns.Array3f(v % edge, v // edge % edge, v // (edge * edge))) / resolution
     value = dr.clip(field.log_density(u), *_LOG_RANGE)
     dr.eval(value)
@@ -176,7 +176,8 @@ def _evaluate_blocks(field: RadianceNetwork, blocks: np.ndarray, resolution: int
     for k in range(8):
         offset = (k & 1) + edge * (k >> 1 & 1) + edge * edge * (k >> 2)
         highest = dr.maximum(highest, dr.gather(ns.Float, value, first + offset))
-    center = (block_corners(dr.gather(ns.UInt32, index, block), n, ns) * BLOCK_EDGE + ns.Array3f(x, y, z) + 0.5) / resolution
+    corner = find_block_corners(dr.gather(ns.UInt32, index, block), n, ns) * BLOCK_EDGE
+    center = (corner + ns.Array3f(x, y, z) + 0.5) / resolution
     matter = (highest > threshold) & _is_occupied(field, center)
     masks = np.packbits(matter.numpy().reshape(len(blocks), CELLS), axis=1, bitorder="little").view("<u4")
     return ns.Float16(value).numpy().reshape(-1, VERTICES), masks

@@ -95,7 +95,9 @@ class VoxelColors:
     def decode(self, numbers: list[Float], opacity: Float, d: Array3f) -> list[Float]:
         """Colour times ``opacity`` along unit ``d``, of the sums Σ w q with the weights of ``opacity`` = Σ w."""
         b = self.net(encode_direction(d, self._degree))
-        color = [b[-3 + c] * opacity + sum(q * b[3 * k + c] for k, q in enumerate(numbers)) for c in range(3)]
+        color: list[Any] = [
+            b[-3 + c] * opacity + sum(q * b[3 * k + c] for k, q in enumerate(numbers)) for c in range(3)
+        ]
         return [dr.clip(c, 0, opacity) for c in color]
 
 
