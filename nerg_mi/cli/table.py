@@ -423,11 +423,11 @@ TABLE = (
     Row(
         "compile",
         "nerg_mi.train.compile:compile_field",
-        "Evaluate the density of a radiance field on voxels once, so that it renders faster.",
+        "Evaluate the density, and the colour, of a radiance field on voxels once, so that it renders faster.",
         ("field",),
         "Compiled radiance field to write (.safetensors).",
         (".safetensors",),
-        without=("max_depth_error", "memory"),
+        without=("max_depth_error",),
     ),
     Row(
         "bake",

@@ -24,7 +24,7 @@ from .voxels import BLOCK_EDGE, COLOR_NUMBERS, VoxelColors, VoxelGrid
 # at vertices, whose trilinear interpolant they are compared with (SIRT, Gilbert 1972).
 
 _BATCH = 1 << 11  # Blocks per launch
-_POINTS_PER_CELL = 8  # Points in a cell of the lattice
+_POINTS_PER_CELL = 8  # Points in a cell of the lattice, one in each octant
 _DIRECTIONS = 16  # Directions in which a point is seen
 _BASIS_DIRECTIONS = 64  # The same for the points that determine the basis
 _BASIS_BLOCKS = 1 << 12  # Blocks that determine it
@@ -129,7 +129,8 @@ def _sample_points(
     lane = dr.arange(ns.UInt32, len(blocks) * per_block)
     cell, block = lane % per_block // _POINTS_PER_CELL, lane // per_block
     jitter = to_vector(ns.Array3f, rng.random((len(blocks) * per_block, 3), np.float32))
-    position = (ns.Array3f(cell % edge, cell // edge % edge, cell // edge**2) + jitter) / edge
+    octant = 0.5 * (ns.Array3f(lane & 1, lane >> 1 & 1, lane >> 2 & 1) + jitter)
+    position = (ns.Array3f(cell % edge, cell // edge % edge, cell // edge**2) + octant) / edge
     index = dr.gather(ns.UInt32, ns.UInt32(copy_aligned(blocks, np.uint32)), block)
     u = (find_block_corners(index, n, ns) + position) / n
     weight, inwards = _estimate_visibility(field, resolution, u)

@@ -194,6 +194,13 @@ def test_a_compiled_field_states_its_errors(tmp_path, nerg):
         compile_field(tmp_path / "f.safetensors", resolution=256, memory=1)
     ended = nerg("compile", tmp_path / "g.safetensors", "-o", tmp_path / "h.safetensors")
     assert ended.code == 1 and "compiled already" in ended.err
+    options = ("-o", tmp_path / "h.safetensors", "--resolution", 16, "--color")
+    ended = nerg("compile", tmp_path / "f.safetensors", *options, "--min-psnr", 10)
+    assert ended.code == 0 and " dB compared with the networks" in ended.out
+    assert "colors" in read_metadata(tmp_path / "h.safetensors")["voxels"]
+    ended = nerg("compile", tmp_path / "f.safetensors", *options, "--min-psnr", 100)
+    assert ended.code == 0 and "--min-psnr" in ended.err
+    assert "colors" not in read_metadata(tmp_path / "h.safetensors")["voxels"]
 
 
 @pytest.mark.nightly
