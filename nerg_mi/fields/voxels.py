@@ -67,15 +67,20 @@ class VoxelColors:
             raise ValueError(f"colours of a lattice of {edge} have the shape {numbers.shape} and type {numbers.dtype}")
         if basis.shape != (outputs, degree**2) or not 1 <= degree <= 10 or not np.isfinite(basis).all():
             raise ValueError(f"the basis of colours must be {outputs} finite rows of harmonics, not {basis.shape}")
-        self._ns, self.edge, self.numbers, self._degree = ns, edge, numbers, degree
+        self._ns, self.edge, self._degree = ns, edge, degree
         self._words = ns.Int32(copy_aligned(numbers.reshape(-1).view(np.int32), np.int32))
         self.net = MLP([ns.TensorXf(copy_aligned(basis))])
         self.net.pack()
 
     @property
+    def numbers(self) -> np.ndarray:
+        """The bytes q of all vertices; not a copy."""
+        return self._words.numpy().view(np.uint8).reshape(-1, (self.edge + 1) ** 3, COLOR_NUMBERS)
+
+    @property
     def size(self) -> int:
         """Bytes of the arrays in a file."""
-        return self.numbers.nbytes + 4 * int(np.prod(self.net.weights[0].shape))
+        return 4 * len(self._words) + 4 * int(np.prod(self.net.weights[0].shape))
 
     def interpolate(self, block: UInt32, position: Array3f, active: Bool) -> list[Float]:
         """The numbers q at a ``position`` (0..1 along each axis) of a ``block``."""

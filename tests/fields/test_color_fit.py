@@ -8,6 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from nerg_mi.environment.tensors import render_tensor
 from nerg_mi.fields.color_fit import fit_colors
 from nerg_mi.fields.compilation import attach_voxels, compile_density
 from nerg_mi.fields.encoding import encode_direction
@@ -141,6 +142,10 @@ def test_scenes_read_differentiate_and_discard_colors(tmp_path):
 
     # Derivatives are rendered with other samples.
     expected = (evaluate(0.01) - evaluate(-0.01)) / 0.02
+    # Replayed images use the current functions of the direction.
+    for scale in (0.01, 0.02, 0.03, 0.04):
+        mean = evaluate(scale)
+        assert np.mean(render_tensor(scene, spp=64).numpy(), dtype=np.float64) == pytest.approx(mean, rel=1e-6)
     params[key] = mi.TensorXf(basis)
     dr.enable_grad(params[key])
     params.update()
