@@ -154,7 +154,8 @@ def _estimate_visibility(field: RadianceNetwork, resolution: int, u: Array3f) ->
     """Fraction of the light that a step at points ``u`` absorbs of what arrives from the side of less matter, some
     cells away, and the unit gradient of the opacity there; 0 without one."""
     ns, step = field.ns, field.march_step or field.box.diagonal / 1024
-    side = field.box.cube_side if not field.box.is_contracted else 1.0
+    # The core of a contracted box is the middle half of the unit cube.
+    side = field.box.core.cube_side * (2 if field.box.is_contracted else 1)
     density = lambda u: field.density(field.box.from_unit(u)) * step
     cell, slopes = dr.opaque(ns.Float, 1 / resolution), []
     for axis in range(3):

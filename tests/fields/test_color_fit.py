@@ -12,10 +12,11 @@ from nerg_mi.environment.tensors import render_tensor
 from nerg_mi.fields.color_fit import fit_colors
 from nerg_mi.fields.compilation import attach_voxels, compile_density
 from nerg_mi.fields.encoding import encode_direction
-from nerg_mi.fields.occupancy import OccupancyGrid
+from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid
 from nerg_mi.fields.voxels import COLOR_NUMBERS, VoxelColors, VoxelGrid
 from nerg_mi.formats.fields import load_radiance, save_radiance
 from nerg_mi.maths.arrays import to_vector
+from nerg_mi.maths.geometry import Box, ContractedBox
 from nerg_mi.train.compile import _compute_psnr, _make_rays, _render, compile_field
 from tests.fields.test_voxels import arrays, make_field, points
 from tests.plugins.fields import radiance
@@ -109,6 +110,26 @@ def test_fitted_colors_converge_and_depend_on_the_direction():
     basis[:, 1:] = 0
     stored.voxels.replace("color_basis", ns.TensorXf(basis))
     assert _compute_psnr(reference, _render(stored, rays)[0]) < psnr[2] - 3
+
+
+@pytest.mark.parametrize("kind", ["deferred", "contracted"])
+def test_colors_of_other_fields(kind, tmp_path):
+    """Of deferred shading, whose network adds to the logits of a diffuse colour, and of an unbounded scene."""
+    if kind == "deferred":
+        field = radiance(tmp_path / "f.safetensors", density_scale=20.0, deferred=True)
+    else:
+        box = ContractedBox(Box((-1, -1, -1), (1, 1, 1)), 16.0)
+        bits = np.ones((5, 16, 16, 16), bool)
+        bits[0, 4:12, 4:12, 4:12] = False
+        field = make_field(box, march_growth=1 / 64, offset=3.0, occupancy=CascadeGrid(bits, 16.0, ns, 0.0))
+    compiled = attach_voxels(field, compile_density(field, 64))
+    rays = _make_rays(compiled)
+    reference = _render(compiled, rays)[0]
+    compiled.voxels.colors = fit_colors(compiled, 4)
+    stored = _render(compiled, rays)[0]
+    # Of one colour for all rays, the error is the standard deviation.
+    assert _compute_psnr(reference, stored) > 6 - 20 * np.log10(reference[:, :3].std(axis=0).mean())
+    assert not np.array_equal(reference[:, :3], stored[:, :3])
 
 
 def test_scenes_read_differentiate_and_discard_colors(tmp_path):
