@@ -193,8 +193,8 @@ def test_networks_are_kept_where_colors_are_not_accurate_or_too_large(tmp_path):
     size = plain.provenance["compiled"]["size"] / 1e6
     large = compile_colors(1.05 * size)
     assert large.network.voxels.colors is None and "memory" in recorder.warnings[-1]
-    kept = compile_colors(1.2 * size, 100)
-    assert kept.network.voxels.colors is None and "stored_color" not in kept.provenance
+    accurate = compile_colors(1.2 * size, 100)
+    assert accurate.network.voxels.colors is None and "stored_color" not in accurate.provenance
     assert "min_psnr" in recorder.warnings[-1] and "networks" in recorder.warnings[-1]
     count = len(recorder.warnings)
     stored = compile_colors(1.2 * size)
