@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from .aoi.areas import Areas
     from .aoi.attention import attention
     from .aoi.bids import export_rays
+    from .aoi.robustness import robustness
     from .aoi.statistics import statistics
     from .environment.arrays import Camera
     from .environment.contents import DensityGrid
@@ -135,6 +136,7 @@ _MODULES = {
     "render_film": "nerg_mi.figures.films",
     "render_tensor": "nerg_mi.environment.tensors",
     "report": "nerg_mi.reports.report",
+    "robustness": "nerg_mi.aoi.robustness",
     "split_rays": "nerg_mi.tracking.splits",
     "statistics": "nerg_mi.aoi.statistics",
     "study": "nerg_mi.evaluation.study_run",
@@ -199,6 +201,7 @@ __all__ = [
     "render_film",
     "render_tensor",
     "report",
+    "robustness",
     "split_rays",
     "statistics",
     "study",

@@ -205,7 +205,7 @@ def statistics(
     eyes = None if observers is None else _check_observers(observers)
     counting = Counting(
         rules,
-        _make_windows(windows or {}),
+        make_windows(windows or {}),
         () if zone_areas is None else tuple(Areas.open_boxes(zone_areas, "zones")),
         None if cohorts is None else to_path(cohorts),
         aoi_visibility,
@@ -268,7 +268,7 @@ def statistics(
     return replace(result, num_suppressed=num_suppressed, provenance=provenance)
 
 
-def _make_windows(windows: Mapping[str, Sequence[float]]) -> tuple[TimeWindow, ...]:
+def make_windows(windows: Mapping[str, Sequence[float]]) -> tuple[TimeWindow, ...]:
     made = []
     for name, values in windows.items():
         ends = to_numbers(values, f"the time window {name!r}").ravel().tolist()

@@ -459,6 +459,18 @@ TABLE = (
         without=("fov", "eye_height", "floor_height", "grid_step"),
     ),
     Row(
+        "robustness",
+        "nerg_mi.aoi.robustness:robustness",
+        "Test whether conclusions of attention statistics survive other choices of filters, areas and alignment.",
+        ("inputs",),
+        "Folder for tables and a figure.",
+        folder=True,
+        fastest=True,
+        spellings={"windows": ("--window",)},
+        groups={INPUT: ("aois", "align", "cohorts", "validation", "windows", "zones"), ANALYSIS: ("analyses", "seed")},
+        without=("choices", "resamples", "min_visit", "tolerance"),
+    ),
+    Row(
         "report",
         "nerg_mi.reports.report:report",
         "Write an HTML report on a gaze field: verdict, figures, scores and a 3D view in one file.",

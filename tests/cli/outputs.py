@@ -52,6 +52,11 @@ STATS += "aois.png transitions.png "
 STATS += "about.json"
 if has_parquet():
     STATS += " aois.parquet transitions.parquet durations.parquet participants.parquet"
+ROBUSTNESS = " ".join(
+    f"{table}{suffix}"
+    for table in ("conclusions", "analyses", "estimates")
+    for suffix in (".csv", ".md", *([".parquet"] if has_parquet() else []))
+)
 GAZE = "--radius 0.6 --steps 2 --min-rays 8 --seed 1"
 
 
@@ -155,6 +160,12 @@ CASES = (
         _below("numbers", STATS),
         ("numbers",),
     ),
+    Case(
+        "robustness",
+        "{i}/rays.npz -o {o}/numbers --aois {i}/areas.json --analyses 10 -m llvm_ad_rgb --store {i}/store",
+        _below("numbers", ROBUSTNESS + " robustness.png about.json"),
+        ("numbers",),
+    ),
     Case("align", "-o {o}/a.json --pairs {i}/pairs.csv", ("a.json", "a.png")),
     Case("rays plot", "{i}/rays.npz -o {o}/a.png --kind layout", ("a.png",)),
     Case(
@@ -251,6 +262,7 @@ INPUTS = {
     "view": {"areas", "align"},
     "render": {"frames"},
     "stats": {"aois", "align", "zones", "cohorts", "validation", "objects", "what_if", "salt"},
+    "robustness": {"aois", "align", "zones", "cohorts", "validation"},
     "draw floor": {"scene"},
     "align": {"environment", "surface", "pairs", "tracking_surface", "tracking_cameras", "scene_cameras", "init"},
     "rays events": {"targets"},

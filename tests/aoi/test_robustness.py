@@ -1,0 +1,171 @@
+"""Robustness of conclusions: true differences survive other choices, others do not, and parts equal the loop."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+import nerg_mi as nerg
+from nerg_mi.aoi.robustness import Choices
+from nerg_mi.aoi.robustness_output import explain_variance
+from nerg_mi.aoi.settings import TrackerError
+from nerg_mi.tasks.settings import Parallel
+from nerg_mi.tracking.rays import Rays
+from tests.aoi.place import people, write_place
+from tests.conftest import ROOT
+
+CENTERS = np.array([[-8.0, 0.0], [0.0, 0.0], [8.0, 0.0], [0.0, 12.0]])  # degrees; the last one is no area
+DISTANCE = 10.0
+AREAS = {
+    name: [
+        [DISTANCE - 0.1, *(DISTANCE * np.tan(np.radians(center - 3)))],
+        [DISTANCE, *(DISTANCE * np.tan(np.radians(center + 3)))],
+    ]
+    for name, center in zip("abc", CENTERS)
+}
+FIXATION, RATE = 6, 20  # samples of a fixation, and samples per second
+
+
+def record(shares: np.ndarray, seed: int, count: int = 16, fixations: int = 40) -> Rays:
+    """Participants who look at the centres with ``shares`` of their fixations, around which their own shares vary."""
+    rng = np.random.default_rng(seed)
+    angles = []
+    for _ in range(count):
+        target = rng.choice(len(CENTERS), fixations, p=rng.dirichlet(20 * shares))
+        middle = CENTERS[target] + rng.uniform(-2.5, 2.5, (fixations, 2))
+        angles.append(np.repeat(middle, FIXATION, axis=0) + rng.normal(0, 0.05, (fixations * FIXATION, 2)))
+    y, z = np.tan(np.radians(np.concatenate(angles))).T
+    each = fixations * FIXATION
+    return nerg.Rays.from_arrays(
+        np.zeros((count * each, 3)),
+        np.column_stack([np.ones_like(y), y, z]),
+        times=np.tile(np.arange(each) / RATE, count),
+        participants=np.repeat([f"p{k:02d}" for k in range(count)], each),
+        tracking="eye",
+    )
+
+
+def verdicts(result, measure="share"):
+    return {row["conclusion"]: row["verdict"] for row in result.conclusions if row["measure"] == measure}
+
+
+def test01_a_true_difference_survives():
+    result = nerg.robustness(record(np.array([0.5, 0.2, 0.1, 0.2]), 1), AREAS, analyses=20)
+    rows = {row["conclusion"]: row for row in result.conclusions if row["measure"] == "share"}
+    assert rows["a > b"]["verdict"] == rows["a > c"]["verdict"] == rows["a is number 1"]["verdict"] == "survives"
+    assert rows["a > b"]["excludes_zero"] > 0.99
+    assert rows["a > b"]["reference"] == pytest.approx(0.3, abs=0.08)
+    assert {choice["samples"] for choice in result.analyses} == {"all", "fixations"}
+
+
+def test02_equal_areas_hardly_ever_differ():
+    counts = []
+    for seed in range(8):
+        result = nerg.robustness(record(np.array([0.25, 0.25, 0.25, 0.25]), seed), AREAS, analyses=10)
+        found = verdicts(result)
+        pairs = [verdict for name, verdict in found.items() if ">" in name]
+        counts += pairs
+    assert len(counts) > 20
+    assert counts.count("survives") <= 4 and counts.count("undecided") >= 12
+
+
+def test03_equal_seeds_give_equal_tables():
+    rays = record(np.array([0.4, 0.3, 0.1, 0.2]), 2, count=6)
+    first, second = (nerg.robustness(rays, AREAS, analyses=10, seed=3) for _ in range(2))
+    assert first.conclusions == second.conclusions and first.estimates == second.estimates
+    assert nerg.robustness(rays, AREAS, analyses=10, seed=4).analyses != first.analyses
+    # More analyses contain the first ones.
+    assert nerg.robustness(rays, AREAS, analyses=12, seed=3).analyses[:10] == first.analyses
+
+
+def test04_parts_equal_the_loop(tmp_path, rgb, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    write_place(tmp_path, gaze=False)
+    align = nerg.Alignment(np.eye(4), {"kind": "pairs"}, {}, {"cm": 2.0, "degrees": 0.5, "scale_percent": 0.1})
+    align.save(tmp_path / "align.json")
+    align_file, error = tmp_path / "align.json", TrackerError(accuracy=1.0, draws=2)
+
+    def test(parallel: Parallel):
+        inputs = [tmp_path / "scene.xml", people(each=40).with_tracking("eye")]
+        areas = tmp_path / "areas.json"
+        return nerg.robustness(inputs, areas, align=align_file, error=error, analyses=10, parallel=parallel)
+
+    result, parts = test(Parallel()), test(Parallel(store=tmp_path / "store", scheduler="local:1"))
+    assert parts.estimates == result.estimates and parts.conclusions == result.conclusions
+    names = {row["conclusion"] for row in result.conclusions}
+    assert any(name.startswith("both: cohort") for name in names) and not any("both >" in name for name in names)
+    assert {choice["tracker"] for choice in result.analyses} == {"corrected", "ignored"}
+    shifts = np.array([[choice[f"shift_{axis}"] for axis in "xyz"] for choice in result.analyses])
+    assert 0 < np.abs(shifts).max() <= 0.04
+    assert 0 < max(abs(choice["rotation"]) for choice in result.analyses) <= 1.0
+
+
+def test05_the_choice_that_decides_is_named():
+    """An area whose lower edge crosses the gaze gains gaze as it grows; nothing else changes shares here."""
+    rays = record(np.array([0.5, 0.2, 0.1, 0.2]), 1)
+    halved = {**AREAS, "a": [[DISTANCE - 0.1, -2, 0.0], [DISTANCE, -0.8, 1.0]]}
+    choices = Choices(tolerance=(0.0, 0.0), growth=(-0.3, 0.3), weighting=("participants",), samples=("all",))
+    result = nerg.robustness(rays, halved, analyses=40, choices=choices)
+    row = next(row for row in result.conclusions if (row["conclusion"], row["measure"]) == ("a > c", "share"))
+    growth = [choice["growth"] for choice in result.analyses]
+    estimates = [e["estimate"] for e in result.estimates if (e["conclusion"], e["measure"]) == ("a > c", "share")]
+    assert np.all(np.diff(np.array(estimates)[np.argsort(growth)]) >= -1e-9)
+    assert row["decides"] == "growth" and row["explained"] > 0.8
+    assert row["smallest"] < row["reference"] < row["largest"]
+
+
+def test06_explained_variance():
+    rng = np.random.default_rng(0)
+    number, text = rng.random(200).tolist(), rng.choice(["x", "y"], 200).tolist()
+    values = np.array([1.0 if t == "x" else 0.0 for t in text])
+    assert explain_variance(text, values) == pytest.approx(1.0)
+    assert explain_variance(number, values) < 1e-12
+    assert explain_variance(number, np.array(number)) == pytest.approx(15 / 16, abs=0.02)
+    assert explain_variance(number, np.ones(200)) < 1e-12
+    some = [v if t == "x" else None for v, t in zip(number, text)]
+    explained = explain_variance(some, np.array([v if t == "x" else 0.5 for v, t in zip(number, text)]))
+    assert 0.8 < explained <= 1.0
+    assert explain_variance([None] * 200, values) < 1e-12
+
+
+@pytest.mark.parametrize(
+    "choices",
+    [
+        {"min_visit": (0.2, 0.1)},
+        {"min_visit": (0.1,)},
+        {"tolerance": (0.0, 50.0)},
+        {"samples": ("some",)},
+        {"weighting": ()},
+        {"shift": -1.0},
+    ],
+)
+def test07_invalid_ranges(choices):
+    with pytest.raises(nerg.NergError, match=next(iter(choices))):
+        Choices(**choices)
+
+
+def test08_invalid_inputs(tmp_path, rgb):
+    rays = record(np.array([0.4, 0.3, 0.1, 0.2]), 2, count=3, fixations=5)
+    write_place(tmp_path)
+    for inputs in (tmp_path / "scene.xml", [rays, tmp_path / "gaze.safetensors"]):
+        with pytest.raises(nerg.NergError, match="rays"):
+            nerg.robustness(inputs, AREAS)
+    with pytest.raises(nerg.NergError, match="AOIs"):
+        nerg.robustness(rays)
+    with pytest.raises(nerg.NergError, match="fixation"):
+        nerg.robustness(rays.with_tracking("head"), AREAS, choices=Choices(samples=("fixations",)))
+
+
+def test09_files_and_verdict(tmp_path):
+    windows = {"early": (0.0, 3.0), "late": (3.0, 100.0)}
+    result = nerg.robustness(record(np.array([0.4, 0.3, 0.1, 0.2]), 5), AREAS, analyses=10, windows=windows)
+    files = result.save(tmp_path / "out")
+    assert all(file.is_file() for file in files) and sorted(tmp_path.joinpath("out").iterdir()) == sorted(files)
+    assert json.loads((tmp_path / "out" / "about.json").read_text())
+    assert len(result.to_dataframe()) == len(result.conclusions)
+    assert len(result.estimates) == 10 * len(result.conclusions)
+    assert any("window early > late" in n or "window late > early" in n for n in verdicts(result))
+    depends = [row for row in result.conclusions if row["verdict"] == "depends"]
+    assert len(result.verdict.splitlines()) == 1 + len(depends)
