@@ -22,7 +22,7 @@ from nerg_mi.formats.boxes import Region
 from nerg_mi.interruption import Interruption
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.progress import Progress, Reporter, open_reporter
-from nerg_mi.ranges import SECONDS, SEEDS, Range, ValidatedDataclass, check_ranges, range_field
+from nerg_mi.ranges import SEEDS, Range, check_ranges
 from nerg_mi.tasks.execution import prepare_once
 from nerg_mi.tasks.parts import PartRunner
 from nerg_mi.tasks.settings import Parallel
@@ -36,7 +36,7 @@ from .estimates import estimate_ratio_differences
 from .measured import AoiContext, Counting, count_block, iter_blocks
 from .placed import PlacedAreas, open_placed_areas, place_areas
 from .robustness_output import Conclusion, RobustnessResult, conclusion_rows
-from .settings import AoiSampling, TrackerError, VisitRules
+from .settings import AoiSampling, Choices, TrackerError, VisitRules
 from .statistics import make_windows
 from .statistics_parts import PlannedAreas, read_sums, save_objects, write_sums
 from .tables import MEASURES_BY_NAME, Pair, Participants, Row
@@ -54,65 +54,21 @@ neighbours in the order of the reference are, and of more values, the first ones
 MAX_SHRINKAGE = 0.45  # of the extent of a box, at each of its sides
 
 
-@dataclass(frozen=True, kw_only=True)
-class Choices(ValidatedDataclass):
-    """Ranges from which the choices of an analysis are drawn evenly. Equal ends: the choice is not varied."""
-
-    min_visit: tuple[float, float] = range_field((0.05, 0.2), SECONDS)
-    """Shortest visit in seconds."""
-    merge_gap: tuple[float, float] = range_field((0.075, 0.3), SECONDS)
-    """Longest interruption of a visit in seconds."""
-    max_gap: tuple[float, float] = range_field((0.5, 2.0), SECONDS)
-    """Longest gap between samples in seconds."""
-    tolerance: tuple[float, float] = range_field((0.0, 1.0), Range(0, 20))
-    """Angular tolerance in degrees."""
-    margin: tuple[float, float] = range_field((0.01, 0.1), Range(0, 10**6))
-    """Depth tolerance in metres."""
-    growth: tuple[float, float] = range_field((-0.03, 0.03), Range(-(10**6), 10**6))
-    """Metres by which each side of a box moves outwards."""
-    rotation: float | None = range_field(None, Range(0, 180))
-    """Largest rotation about the vertical axis through the mean position, in degrees. None: twice the standard
-    deviation in the alignment file, or none without one."""
-    shift: float | None = range_field(None, Range(0, 10**6))
-    """Largest shift along each axis in metres. None: as for ``rotation``."""
-    weighting: tuple[str, ...] = ("participants", "time")
-    """Weights of participants in shares: the same for each, or the recorded time."""
-    samples: tuple[str, ...] = ("all", "fixations")
-    """Samples that count: all, or those of fixations (I-VT). The time between fixations then belongs to the earlier
-    one, up to ``max_gap``."""
-    velocity: tuple[float, float] = range_field((20.0, 100.0), Range(0.1, 10**6))
-    """Velocity in degrees per second above which a fixation ends."""
-    min_fixation: tuple[float, float] = range_field((0.06, 0.15), SECONDS)
-    """Shortest fixation in seconds."""
-    tracker: tuple[str, ...] = ("corrected", "ignored")
-    """Error of the eye tracker, if one is given."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(field.default, tuple) and isinstance(field.default[0], str):
-                if not value or not set(value) <= set(field.default):
-                    raise NergError(f"{field.name} must be some of {', '.join(field.default)}, got {value!r}")
-            elif isinstance(field.default, tuple) and not (len(value) == 2 and value[0] <= value[1]):
-                raise NergError(f"{field.name} must be a lower and an upper end, got {value!r}")
-
-    def draw(self, rng: np.random.Generator) -> Row:
-        """Draw the choices of one analysis, by name; those that depend on another choice are None if it excludes
-        them."""
-        choice: Row = {}
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if field.name in ("rotation", "shift"):
-                names = [field.name] if field.name == "rotation" else ["shift_x", "shift_y", "shift_z"]
-                choice |= {name: float(rng.uniform(-1, 1)) * (value or 0.0) for name in names}
-            elif isinstance(value[0], str):
-                choice[field.name] = value[int(rng.integers(len(value)))]
-            else:
-                choice[field.name] = float(rng.uniform(*value))
-        if choice["samples"] == "all":
-            choice |= {"velocity": None, "min_fixation": None}
-        return choice
+def draw_choices(choices: Choices, rng: np.random.Generator) -> Row:
+    """Draw the choices of one analysis, by name; those that depend on another choice are None if it excludes them."""
+    choice: Row = {}
+    for field in fields(choices):
+        value = getattr(choices, field.name)
+        if field.name in ("rotation", "shift"):
+            names = [field.name] if field.name == "rotation" else ["shift_x", "shift_y", "shift_z"]
+            choice |= {name: float(rng.uniform(-1, 1)) * (value or 0.0) for name in names}
+        elif isinstance(value[0], str):
+            choice[field.name] = value[int(rng.integers(len(value)))]
+        else:
+            choice[field.name] = float(rng.uniform(*value))
+    if choice["samples"] == "all":
+        choice |= {"velocity": None, "min_fixation": None}
+    return choice
 
 
 # ---- Analyses ----
@@ -319,7 +275,7 @@ def robustness(
     aois : Areas, path or mapping
         JSON file of areas of interest (AOIs), as for ``nerg stats``.
     choices : Choices
-        Ranges of the choices (`nerg_mi.aoi.robustness.Choices`).
+        Ranges of the choices (`nerg_mi.aoi.settings.Choices`).
     analyses : int
         Number of analyses with choices drawn at random.
     align : path or similarity, optional
@@ -402,7 +358,7 @@ def robustness(
         for note in base.placed.warnings:
             reporter.message(note)
         choices = _adapt_choices(choices, base, align, reporter)
-        drawn = [choices.draw(np.random.default_rng((seed, k))) for k in range(analyses)]
+        drawn = [draw_choices(choices, np.random.default_rng((seed, k))) for k in range(analyses)]
         table = [base.get_reference(), *drawn]
         if parallel.in_parts:
             planned = PlannedAreas(None, None, areas, matrix, sampling, mode)

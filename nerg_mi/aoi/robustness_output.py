@@ -64,11 +64,11 @@ def explain_variance(values: Sequence[Any], estimates: np.ndarray) -> float:
     rows = np.array([v is not None for v in values]) & np.isfinite(estimates)
     deviation = estimates[np.isfinite(estimates)] - np.mean(estimates[np.isfinite(estimates)])
     total = float((deviation**2).sum())
-    known, y = np.array([v for v, is_known in zip(values, rows) if is_known]), estimates[rows]
-    if len(y) and known.dtype.kind == "f":
-        edges = np.quantile(known, np.arange(1, _NUM_BINS) / _NUM_BINS)
-        known = np.searchsorted(edges, known)
-    groups = [y[known == value] for value in np.unique(known)]
+    labels, y = np.array([v for v, is_row in zip(values, rows) if is_row]), estimates[rows]
+    if len(y) and labels.dtype.kind == "f":
+        edges = np.quantile(labels, np.arange(1, _NUM_BINS) / _NUM_BINS)
+        labels = np.searchsorted(edges, labels)
+    groups = [y[labels == value] for value in np.unique(labels)]
     # Rounding errors of equal estimates are no variance.
     if len(groups) < 2 or len(y) <= len(groups) or total <= len(estimates) * (1e-9 * np.abs(y).max()) ** 2:
         return 0.0
@@ -110,8 +110,8 @@ def conclusion_rows(estimates: Sequence[Mapping[Conclusion, Triple]], drawn: Seq
         rows.append(row)
         for k, (estimate, (low, high)) in enumerate(zip(value.tolist(), ends.tolist()), 1):
             numbers = {"estimate": estimate, "low": low, "high": high}
-            known = {name: None if np.isnan(number) else number for name, number in numbers.items()}
-            long.append({"analysis": k, "conclusion": row["conclusion"], "measure": row["measure"], **known})
+            cells = {name: None if np.isnan(number) else number for name, number in numbers.items()}
+            long.append({"analysis": k, "conclusion": row["conclusion"], "measure": row["measure"], **cells})
     return RobustnessResult(rows, [{"analysis": k, **choice} for k, choice in enumerate(drawn, 1)], long)
 
 
@@ -210,10 +210,10 @@ class RobustnessResult(ResultTables):
         for height, name in enumerate(names):
             values = [self.analyses[e["analysis"] - 1][name] for e in estimates]
             levels = {v: k for k, v in enumerate(sorted({v for v in values if v is not None}))}
-            known = [k for k, v in enumerate(values) if v is not None]
+            positions = [k for k, v in enumerate(values) if v is not None]
             # Numbers by their ranks, so that rows are filled evenly.
-            y = [height + 0.7 * (levels[values[k]] / max(len(levels) - 1, 1) - 0.5) for k in known]
-            bottom.scatter(known, y, 2, [colors[k] for k in known])
+            y = [height + 0.7 * (levels[values[k]] / max(len(levels) - 1, 1) - 0.5) for k in positions]
+            bottom.scatter(positions, y, 2, [colors[k] for k in positions])
         label_axes(bottom, "analyses, by their estimate", "")
         top.tick_params(labelsize=font_size(7), colors=INK, length=2)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import ClassVar
 
 from nerg_mi.errors import NergError, parameter
@@ -90,3 +90,47 @@ class TrackerError(ValidatedDataclass):
     )
     draws: int = range_field(10, Range(2, 1000))
     """Number of random errors that the correction averages over."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Choices(ValidatedDataclass):
+    """Ranges from which the choices of an analysis are drawn evenly. Equal ends: the choice is not varied."""
+
+    min_visit: tuple[float, float] = range_field((0.05, 0.2), SECONDS)
+    """Shortest visit in seconds."""
+    merge_gap: tuple[float, float] = range_field((0.075, 0.3), SECONDS)
+    """Longest interruption of a visit in seconds."""
+    max_gap: tuple[float, float] = range_field((0.5, 2.0), SECONDS)
+    """Longest gap between samples in seconds."""
+    tolerance: tuple[float, float] = range_field((0.0, 1.0), Range(0, 20))
+    """Angular tolerance in degrees."""
+    margin: tuple[float, float] = range_field((0.01, 0.1), Range(0, 10**6))
+    """Depth tolerance in metres."""
+    growth: tuple[float, float] = range_field((-0.03, 0.03), Range(-(10**6), 10**6))
+    """Metres by which each side of a box moves outwards."""
+    rotation: float | None = range_field(None, Range(0, 180))
+    """Largest rotation about the vertical axis through the mean position, in degrees. None: twice the standard
+    deviation in the alignment file, or none without one."""
+    shift: float | None = range_field(None, Range(0, 10**6))
+    """Largest shift along each axis in metres. None: as for ``rotation``."""
+    weighting: tuple[str, ...] = ("participants", "time")
+    """Weights of participants in shares: the same for each, or the recorded time."""
+    samples: tuple[str, ...] = ("all", "fixations")
+    """Samples that count: all, or those of fixations (I-VT). The time between fixations then belongs to the earlier
+    one, up to ``max_gap``."""
+    velocity: tuple[float, float] = range_field((20.0, 100.0), Range(0.1, 10**6))
+    """Velocity in degrees per second above which a fixation ends."""
+    min_fixation: tuple[float, float] = range_field((0.06, 0.15), SECONDS)
+    """Shortest fixation in seconds."""
+    tracker: tuple[str, ...] = ("corrected", "ignored")
+    """Error of the eye tracker, if one is given."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(field.default, tuple) and isinstance(field.default[0], str):
+                if not value or not set(value) <= set(field.default):
+                    raise NergError(f"{field.name} must be some of {', '.join(field.default)}, got {value!r}")
+            elif isinstance(field.default, tuple) and not (len(value) == 2 and value[0] <= value[1]):
+                raise NergError(f"{field.name} must be a lower and an upper end, got {value!r}")

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 import nerg_mi as nerg
-from nerg_mi.aoi.robustness import Choices
 from nerg_mi.aoi.robustness_output import explain_variance
-from nerg_mi.aoi.settings import TrackerError
+from nerg_mi.aoi.settings import Choices, TrackerError
 from nerg_mi.tasks.settings import Parallel
 from nerg_mi.tracking.rays import Rays
 from tests.aoi.place import people, write_place
@@ -64,9 +63,7 @@ def test02_equal_areas_hardly_ever_differ():
     counts = []
     for seed in range(8):
         result = nerg.robustness(record(np.array([0.25, 0.25, 0.25, 0.25]), seed), AREAS, analyses=10)
-        found = verdicts(result)
-        pairs = [verdict for name, verdict in found.items() if ">" in name]
-        counts += pairs
+        counts += [verdict for name, verdict in verdicts(result).items() if ">" in name]
     assert len(counts) > 20
     assert counts.count("survives") <= 4 and counts.count("undecided") >= 12
 
