@@ -223,7 +223,7 @@ class RobustnessResult(ResultTables):
         folder, files = make_folder(Path(folder)), list[Path]()
         for name in self.TABLES:
             rows = getattr(self, name)
-            files += write_rows(folder, name, rows, *all_columns(rows, ("conclusion",)))
+            files += write_rows(folder, name, rows, *all_columns(rows))
         save(self.draw(), folder / "robustness.png", self.provenance)
         write_text(folder / "about.json", self.provenance.json() + "\n")
         return [*files, folder / "robustness.png", folder / "about.json"]
