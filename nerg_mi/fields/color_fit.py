@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 from nerg_mi.maths.arrays import copy_aligned, to_vector
+from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.maths.types import Array3f, Float
 
 from .compilation import find_block_corners
@@ -44,7 +44,7 @@ def fit_colors(
     rng, blocks = np.random.default_rng(0), _get_voxels(field).blocks
     with dr.suspend_grad():
         basis, low, high = _find_basis(field, rng)
-        directions = _spread_directions(_DIRECTIONS)
+        directions = fibonacci_directions(_DIRECTIONS)
         factors = np.einsum("mh,hck->mck", _evaluate_harmonics(field, directions), basis)
         solvers = _make_solvers(factors, directions)
         numbers = np.empty((len(blocks), (edge + 1) ** 3, COLOR_NUMBERS), np.uint8)
@@ -70,7 +70,7 @@ def _get_voxels(field: RadianceNetwork) -> VoxelGrid:
 
 def _find_basis(field: RadianceNetwork, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The functions of the direction (harmonics, 3, K), and the lowest and highest of their numbers (K,)."""
-    blocks, directions = _get_voxels(field).blocks, _spread_directions(_BASIS_DIRECTIONS)
+    blocks, directions = _get_voxels(field).blocks, fibonacci_directions(_BASIS_DIRECTIONS)
     some = np.sort(rng.choice(blocks, min(len(blocks), _BASIS_BLOCKS), replace=False))
     _, _, weight, kind, colors = _sample_points(field, some, 2, directions, rng)
     y = _evaluate_harmonics(field, directions)
@@ -82,14 +82,6 @@ def _find_basis(field: RadianceNetwork, rng: np.random.Generator) -> tuple[np.nd
     low, high = np.quantile(values, [0.0002, 0.9998], axis=0)
     margin = 0.05 * (high - low) + 1e-6
     return components.T.reshape(-1, 3, COLOR_NUMBERS), low - margin, high + margin
-
-
-def _spread_directions(count: int) -> np.ndarray:
-    """Directions (count, 3) of equal areas of the sphere (Fibonacci lattice)."""
-    k = np.arange(count) + 0.5
-    z, angle = 1 - 2 * k / count, math.pi * (1 + math.sqrt(5)) * k
-    r = np.sqrt(1 - z * z)
-    return np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
 
 
 def _evaluate_harmonics(field: RadianceNetwork, directions: np.ndarray) -> np.ndarray:
