@@ -99,7 +99,7 @@ def test01_no_block_is_left_out():
         ("python.md", "py"),
         ("exchange.md", "py"),
     }
-    here |= {("moving-objects.md", language) for language in ("text", "python")}
+    here |= {("moving-objects.md", language) for language in ("text", "python")} | {("other-choices.md", "python")}
     here |= {(f"{page}.md", "json") for page in ("viewer", "store", "statistics")}
     here |= {
         (f"{page}.md", "python")
@@ -231,6 +231,12 @@ def test_objects_move(rgb, tmp_path):
     assert rows["box"] == pytest.approx(0.55, abs=0.03) and rows["box"] + rows["wall"] == pytest.approx(1)
     assert len(names["on_box"]) == pytest.approx(22, abs=1) and np.allclose(names["on_box"].hit[:, 0], 2.8, atol=1e-3)
     assert names["baked"].on_surface > 0.9
+
+
+def test_other_choices():
+    (block,) = blocks("python", page="other-choices.md")
+    rows = {row["conclusion"]: row for row in run(block.text, block.page)["result"].conclusions[:2]}
+    assert rows["shelf > sign"]["verdict"] == "survives" and rows["shelf > sign"]["reference"] > 0.3
 
 
 def test08_datasets(tmp_path, monkeypatch):
