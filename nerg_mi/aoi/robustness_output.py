@@ -158,7 +158,7 @@ class RobustnessResult(ResultTables):
         count = {name: sum(row["verdict"] == name for row in differences) for name in ("survives", "undecided")}
         lines = [
             f"{count['survives']} of {len(differences)} differences survive {len(self.analyses)} analyses with other "
-            f"choices, and {count['undecided']} are undecided in all."
+            f"choices, and {count['undecided']} are undecided."
         ]
         for row in self.conclusions:
             if row["verdict"] == "depends":
@@ -187,13 +187,16 @@ class RobustnessResult(ResultTables):
         names.remove("analysis")
         if axes is None:
             page = new_page(180 + 260 * max(len(shown), 1), (260 + 22 * len(names)) * text_scale())
-            axes = page.subplots(2, max(len(shown), 1), sharex=True, sharey="row", squeeze=False)
-            page.subplots_adjust(left=0.42 / (1 + 0.6 * len(shown)), right=0.98, top=0.9, bottom=0.08, hspace=0.08)
+            axes = page.subplots(2, max(len(shown), 1), sharex=True, squeeze=False)
+            page.subplots_adjust(
+                left=0.42 / (1 + 0.6 * len(shown)), right=0.98, top=0.89, bottom=0.13, hspace=0.08, wspace=0.25
+            )
         grid = as_axes(axes, 2 * max(len(shown), 1)).reshape(2, -1)
         for (top, bottom), row in zip(grid.T, shown):
             self._draw_curve(top, bottom, row, names)
         label_axes(grid[0, 0], "", "difference")
-        grid[1, 0].set_yticks(range(len(names)), names)
+        for k, bottom in enumerate(grid[1]):
+            bottom.set_yticks(range(len(names)), [name if k == 0 else "" for name in names])
         return axes
 
     def _draw_curve(self, top: Any, bottom: Any, row: Row, names: Sequence[str]) -> None:
