@@ -32,7 +32,6 @@ from nerg_mi.tracking.events import detect_fixations_ivt, warn_unknown_tracking
 from nerg_mi.tracking.rays import TRACKING, Rays
 
 from .areas import AnyAreas, Areas, to_json_values
-from .estimates import estimate_ratio_differences
 from .measured import AoiContext, Counting, count_block, iter_blocks
 from .placed import PlacedAreas, open_placed_areas, place_areas
 from .robustness_output import Conclusion, RobustnessResult, conclusion_rows
@@ -193,18 +192,18 @@ class Evaluation:
                 x, y = self._pair(sums, choice, measure, ALL)
                 a, b = np.array(pairs).T
                 keys = [Conclusion("areas", measure, names[i], names[j]) for i, j in pairs]
-                values |= dict(zip(keys, self._subtract((x[:, a], y[:, a]), (x[:, b], y[:, b]))))
+                values |= dict(zip(keys, self._subtract(measure, (x[:, a], y[:, a]), (x[:, b], y[:, b]))))
             for place, k in enumerate(order[:3], 1):
                 values[Conclusion("rank", measure, names[k], place)] = (own_ranks[measure][k], np.nan, np.nan)
             for first, second in _pair_cells(sums.cells):
                 people = sorted({person for cell, person in sums.rows if cell in (first, second)})
                 one, other = (self._pair(sums, choice, measure, cell, people) for cell in (first, second))
                 keys = [Conclusion("cells", measure, first, second, name) for name in names]
-                values |= dict(zip(keys, self._subtract(one, other)))
+                values |= dict(zip(keys, self._subtract(measure, one, other)))
         return values
 
-    def _subtract(self, first: Pair, second: Pair) -> Iterator[tuple[float, float, float]]:
-        d = estimate_ratio_differences(second, first, resamples=self.resamples, seed=self.seed)
+    def _subtract(self, measure: str, first: Pair, second: Pair) -> Iterator[tuple[float, float, float]]:
+        d = MEASURES_BY_NAME[measure].estimate_differences(second, first, self.resamples, self.seed)
         return zip(d.value.tolist(), d.low.tolist(), d.high.tolist())
 
     def _pair(

@@ -13,6 +13,7 @@ from nerg_mi.files.tables import join_reasons
 
 from .estimates import (
     MIN_FOR_INTERVAL,
+    Differences,
     Estimates,
     Pair,
     adjust_p_values,
@@ -151,6 +152,16 @@ class Measure:
             estimate_proportions(x, y)
             if binary
             else estimate_ratios(x, y, resamples=resamples, seed=seed, upper_limit=self.upper_limit)
+        )
+
+    def estimate_differences(self, first: Pair, second: Pair, resamples: int, seed: int) -> Differences:
+        """Estimate the ``second`` minus the ``first`` numerator over denominator, each (P, K) of the same
+        participants."""
+        binary = self.is_proportion and all(bool(np.isin(x, (0.0, 1.0)).all()) for x in (first[0], second[0]))
+        return (
+            estimate_proportion_differences(first, second)
+            if binary
+            else estimate_ratio_differences(first, second, resamples=resamples, seed=seed)
         )
 
 
@@ -441,10 +452,7 @@ def _measure_differences(
     first, second = (measure.numerator_denominator(p) for p in participants)
     if first is None or second is None:
         return []
-    if measure.is_proportion:
-        differences = estimate_proportion_differences(first, second)
-    else:
-        differences = estimate_ratio_differences(first, second, resamples=resamples, seed=seed)
+    differences = measure.estimate_differences(first, second, resamples, seed)
     num_participants = np.minimum((first[1] > 0).sum(axis=0), (second[1] > 0).sum(axis=0))
     rows = []
     for a, area in enumerate(areas):

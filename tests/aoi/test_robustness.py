@@ -68,6 +68,25 @@ def test02_equal_areas_hardly_ever_differ():
     assert counts.count("survives") <= 4 and counts.count("undecided") >= 12
 
 
+def test09_the_reference_has_the_differences_of_statistics():
+    rays, windows = (
+        record(np.array([0.3, 0.1, 0.02, 0.58]), 3, count=12, fixations=12),
+        {"early": (0, 1.5), "late": (1.5, 4)},
+    )
+    result = nerg.robustness(rays, AREAS, analyses=10, windows=windows, resamples=1999)
+    ours = {(row["conclusion"], row["measure"]): row for row in result.conclusions}
+    compared = 0
+    for row in nerg.statistics(rays, AREAS, windows=windows).differences:
+        sign, names = (1, ("late", "early")) if row["difference"] > 0 else (-1, ("early", "late"))
+        key = f"{row['aoi']}: window {names[0]} > {names[1]}", row["measure"]
+        if key in ours and row["low"] is not None:
+            limits = sorted((sign * row["low"], sign * row["high"]))
+            expected = pytest.approx([sign * row["difference"], *limits], rel=1e-6)
+            assert [ours[key][name] for name in ("reference", "low", "high")] == expected, key
+            compared += 1
+    assert compared >= 5
+
+
 def test03_equal_seeds_give_equal_tables():
     rays = record(np.array([0.4, 0.3, 0.1, 0.2]), 2, count=6)
     first, second = (nerg.robustness(rays, AREAS, analyses=10, seed=3) for _ in range(2))
@@ -155,7 +174,7 @@ def test08_invalid_inputs(tmp_path, rgb):
         nerg.robustness(rays.with_tracking("head"), AREAS, choices=Choices(samples=("fixations",)))
 
 
-def test09_files_and_verdict(tmp_path):
+def test10_files_and_verdict(tmp_path):
     windows = {"early": (0.0, 3.0), "late": (3.0, 100.0)}
     result = nerg.robustness(record(np.array([0.4, 0.3, 0.1, 0.2]), 5), AREAS, analyses=10, windows=windows)
     files = result.save(tmp_path / "out")
