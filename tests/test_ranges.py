@@ -80,7 +80,9 @@ def _numbers(kind):
 
 def _fault(kind, field, value) -> str | None:
     """Return the error message for ``value`` of ``field``, ignoring errors about combinations of options."""
-    values = {**PREREQUISITES.get(kind.__name__, {}), field.name: (value,) * 3 if "tuple" in str(field.type) else value}
+    values = {**PREREQUISITES.get(kind.__name__, {}), field.name: value}
+    if "tuple" in str(field.type):
+        values[field.name] = (value,) * (3 if "..." in str(field.type) else str(field.type).count(",") + 1)
     if field.name == "minutes" and "Settings" in kind.__name__:
         values.pop("steps")
     try:

@@ -69,7 +69,7 @@ class Motion:
         """Return the motion at the times with the indices or mask ``rows``."""
         return Motion(self.rotation[rows], self.translation[rows], self.is_present[rows], self.is_unknown[rows])
 
-    def write(self, rows: np.ndarray, part: Motion) -> None:
+    def assign(self, rows: np.ndarray, part: Motion) -> None:
         """Replace the motion at the times with the mask ``rows``."""
         self.rotation[rows], self.translation[rows] = part.rotation, part.translation
         self.is_present[rows], self.is_unknown[rows] = part.is_present, part.is_unknown
@@ -305,7 +305,7 @@ class ObjectPoses:
             track = self._tracks.get((to_name(rays.persons[code]), name)) or self._tracks.get(("", name))
             if track is not None:
                 rows = rays.person == code
-                motion.write(rows, track.find_motion(rays.t[rows], self.max_gap))
+                motion.assign(rows, track.find_motion(rays.t[rows], self.max_gap))
         return motion
 
     def describe_times(self) -> str:
