@@ -11,7 +11,6 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from nerg_mi.environment.inputs import sort_inputs
 from nerg_mi.environment.planned import PlannedFiles
 from nerg_mi.environment.scene_loading import activate_mitsuba
 from nerg_mi.errors import NergError, parameter
@@ -36,7 +35,7 @@ from .measured import AoiContext, Counting, count_block, iter_blocks
 from .placed import PlacedAreas, open_placed_areas, place_areas
 from .robustness_output import Conclusion, RobustnessResult, conclusion_rows
 from .settings import AoiSampling, Choices, TrackerError, VisitRules
-from .statistics import make_windows
+from .statistics import make_windows, open_inputs
 from .statistics_parts import PlannedAreas, read_sums, save_objects, write_sums
 from .tables import MEASURES_BY_NAME, Pair, Participants, Row
 from .visits import ALL, Cell, VisitSums, merge_sums
@@ -332,7 +331,7 @@ def robustness(
     if aois is None:
         raise NergError(f"no AOIs are given; add {parameter('aois', 'FILE')}")
     mode = str(activate_mitsuba().variant())
-    chosen = sort_inputs(inputs).prefer_files()
+    chosen, align = open_inputs(inputs, align)
     if chosen.rays is None or chosen.gaze is not None:
         raise NergError("choices are varied in the analysis of recordings: give rays and no gaze field")
     areas = Areas.open(aois, "aois")

@@ -195,7 +195,7 @@ def statistics(
     if aois is None:
         raise NergError(f"no AOIs are given; add {parameter('aois', 'FILE')}")
     mode = str(activate_mitsuba().variant())
-    chosen, align = _open_inputs(inputs, align)
+    chosen, align = open_inputs(inputs, align)
     areas = Areas.open(aois, "aois")
     zones = to_json_values(zones) if isinstance(zones, Mapping) else zones
     zone_areas = None if zones is None else Areas.open(zones, "zones")
@@ -294,7 +294,7 @@ def _check_observers(observers: ArrayLike) -> np.ndarray:
 # ---- Inputs ----
 
 
-def _open_inputs(inputs: Any, align: Any) -> tuple[Inputs, Any]:
+def open_inputs(inputs: Any, align: Any) -> tuple[Inputs, Any]:
     """Return the inputs by their roles, as files where they have one, and ``align`` or that of an environment in
     memory. A gaze field without a file brings the environment of its training."""
     for item in inputs if isinstance(inputs, (list, tuple)) else [inputs]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import pytest
 import nerg_mi as nerg
 from nerg_mi.aoi.robustness_output import explain_variance
 from nerg_mi.aoi.settings import Choices, TrackerError
+from nerg_mi.maths.geometry import Similarity
 from nerg_mi.tasks.settings import Parallel
 from nerg_mi.tracking.rays import Rays
 from tests.aoi.place import people, write_place
@@ -85,6 +87,17 @@ def test09_the_reference_has_the_differences_of_statistics():
             assert [ours[key][name] for name in ("reference", "low", "high")] == expected, key
             compared += 1
     assert compared >= 5
+
+
+def test11_an_environment_in_memory_has_its_alignment(tmp_path, rgb):
+    write_place(tmp_path, gaze=False)
+    align = Similarity(np.eye(4) + np.eye(4, k=3) * 0.3)
+    environment, rays = nerg.Environment.open(tmp_path / "scene.xml"), people(each=40)
+    areas, settings = tmp_path / "areas.json", {"analyses": 10, "choices": Choices(samples=("all",))}
+    expected = nerg.robustness([tmp_path / "scene.xml", rays], areas, align=align, **settings)
+    result = nerg.robustness([replace(environment, align=align), rays], areas, **settings)
+    unaligned = nerg.robustness([environment, rays], areas, **settings)
+    assert result.estimates == expected.estimates != unaligned.estimates
 
 
 def test03_equal_seeds_give_equal_tables():
