@@ -44,10 +44,11 @@ Gaze field (:monosp:`gazefield`)
    - |exposed|, |differentiable|
 
 How much surfaces attract an observer: equation 1 of the paper, :math:`G(p_{od}, p_o) = F_e(p_{od}, -r_o) \cdot
-\mathrm{sigmoid}(F_c(p_o, r_o))`, a density in 1/sr over the directions around the observer. It is the ``gaze`` of the
-integrator :ref:`nerg <integrator-nerg>`; since it depends on two positions, it cannot be evaluated as a plain volume. A
-field that was trained on the features of a radiance field (option ``semantic`` of a recipe) needs that radiance field
-as the integrator's ``field``.
+\mathrm{sigmoid}(F_c(p_o, r_o))`, a density in 1/sr over the directions around the observer. A log density, the default
+of trainings, divides this product by its integral over all directions, and mixes in a prior. A field is the ``gaze`` of
+the integrator :ref:`nerg <integrator-nerg>`; since it depends on two positions, it cannot be evaluated as a plain
+volume. A field that was trained on the features of a radiance field (option ``semantic`` of a recipe) needs that
+radiance field as the integrator's ``field``.
 
 For an ensemble (``nerg train gaze --ensemble``) gaze is the mean of the members, each normalised separately if it is
 normalised; the AOV ``gaze_std`` of the integrator shows their standard deviation. The checkpoint also stores the number

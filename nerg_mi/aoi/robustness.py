@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
@@ -348,6 +349,8 @@ def robustness(
     files = existing_files(*chosen, *areas.files, align, cohorts, validation)
     files += [] if zone_areas is None else zone_areas.files
     matrix = None if align is None else open_similarity(align, "rays to scene").matrix.tolist()
+    if align is not None and not isinstance(align, (str, os.PathLike)):
+        changed["align"] = matrix
     with open_reporter(progress) as reporter:
         reporter.progress(0.0, "reading")
         base = Analyses(

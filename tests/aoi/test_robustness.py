@@ -98,6 +98,7 @@ def test11_an_environment_in_memory_has_its_alignment(tmp_path, rgb):
     result = nerg.robustness([replace(environment, align=align), rays], areas, **settings)
     unaligned = nerg.robustness([environment, rays], areas, **settings)
     assert result.estimates == expected.estimates != unaligned.estimates
+    assert result.provenance.settings["align"] == expected.provenance.settings["align"] == align.matrix.tolist()
 
 
 def test03_equal_seeds_give_equal_tables():
