@@ -413,9 +413,9 @@ def _adapt_choices(choices: Choices, base: Analyses, align: Any, reporter: Repor
 def _read_uncertainty(align: Any) -> tuple[float, float]:
     """Return twice the standard deviations of an alignment in degrees and metres, or the ends of its interval; zeros
     if they are unknown."""
-    if align is not None and not hasattr(align, "matrix") and not isinstance(align, (list, tuple, np.ndarray)):
-        align = Alignment.load(align)
-    uncertainty = getattr(align, "uncertainty", None) or {}
+    if isinstance(align, (str, os.PathLike)):
+        align = Alignment.load(to_path(align))
+    uncertainty = align.uncertainty or {} if isinstance(align, Alignment) else {}
     if "turn_degrees" in uncertainty:
         return float(np.abs(uncertainty["turn_degrees"]).max()), uncertainty["shift_cm"] / 100
     return 2.0 * uncertainty.get("degrees", 0.0), 2.0 * uncertainty.get("cm", 0.0) / 100
