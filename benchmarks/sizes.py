@@ -30,10 +30,8 @@ class Growth:
 
 def frames(width: int, height: int, spp: int = 1, **values) -> Callable[[], np.ndarray]:
     """A function that renders colour, depth and gaze of the store with ``spp`` samples."""
-    import mitsuba as mi
-
-    scene = nerg.Scene.load(SCENE_FILE, width=width, height=height, aovs="depth,gaze", **values).mitsuba
-    return lambda: np.array(mi.render(scene, sensor=0, spp=spp))
+    scene = nerg.Scene.load(SCENE_FILE, width=width, height=height, aovs="depth,gaze", **values)
+    return lambda: np.array(nerg.render_tensor(scene, spp=spp))
 
 
 def pixels(long: bool) -> Growth:
@@ -93,7 +91,7 @@ def extent(long: bool) -> Growth:
         return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor})
 
     sides = (3.2, 6.4, 12.8, 25.6, *((51.2,) if long else ()))
-    works = {side: partial(lambda s: np.array(mi.render(s, spp=1)), scene(side)) for side in sides}
+    works = {side: partial(lambda s: np.array(nerg.render_tensor(s, spp=1)), scene(side)) for side in sides}
     return Growth("depth of a hall of 0.1 m voxels, 320 x 180", "metres", "below 1", works)
 
 

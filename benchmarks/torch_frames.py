@@ -288,12 +288,13 @@ class Ours:
         scene = nerg.Scene.load(SCENE_FILE, **{**PEER_SCENE, **values}, visibility=visibility)
         if constant:
             scene.set_constant_weights()
-        self.render = partial(mi.render, scene.mitsuba, sensor=0, spp=1)
+        self.render = partial(nerg.render_tensor, scene, spp=1)
         self.params, self.moves, self.frames = mi.traverse(scene.integrator), moves, 0
         start = time.perf_counter()
         self()
         self.first = time.perf_counter() - start
-        # The observer's data is cached now; this compiles the kernel that reads it.
+        # The observer's data is cached now; these compile the kernel that reads it, and record it to be replayed.
+        self()
         self()
 
     def __call__(self) -> np.ndarray:
