@@ -219,7 +219,7 @@ def test_scenes_are_exported(rgb, tmp_path, monkeypatch):
 
 
 def test_objects_move(rgb, tmp_path):
-    from nerg_mi.aoi.objects import ObjectPoses
+    from nerg_mi.tracking.objects import ObjectPoses
 
     (table,) = blocks("text", page="moving-objects.md")
     (tmp_path / "poses.csv").write_text(table.text)

@@ -15,12 +15,12 @@ from nerg_mi.files.values import to_name
 from nerg_mi.formats.boxes import Region
 from nerg_mi.tracking.dataset import RayDataset
 from nerg_mi.tracking.filters import argsort_by_person_time
+from nerg_mi.tracking.objects import ObjectPoses
 from nerg_mi.tracking.rays import Rays, merge_rays
 from nerg_mi.tracking.readers.columns import open_named_table
 
 from .areas import AreaGroup
 from .moving import MovingAreas, place_objects
-from .objects import ObjectPoses
 from .placed import (
     HitAssignment,
     PlacedAreas,

@@ -17,11 +17,11 @@ from nerg_mi.environment.environment import Environment
 from nerg_mi.errors import NergError, parameter, sanitize
 from nerg_mi.formats.alignments import AnySimilarity
 from nerg_mi.progress import Reporter
+from nerg_mi.tracking.objects import Motion, ObjectPoses
 from nerg_mi.tracking.rays import Rays
 from nerg_mi.transport.geometry import SceneGeometry
 
 from .areas import Areas, SceneShape
-from .objects import Motion, ObjectPoses
 from .placed import (
     AoiTarget,
     HitAssignment,

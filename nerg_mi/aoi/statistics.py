@@ -27,6 +27,7 @@ from nerg_mi.ranges import SEEDS, TIMES, Range, check_ranges
 from nerg_mi.tasks.parts import PartRunner
 from nerg_mi.tasks.settings import Parallel
 from nerg_mi.tracking.dataset import RayDataset, open_recordings
+from nerg_mi.tracking.objects import ObjectPoses
 from nerg_mi.tracking.pseudonyms import make_pseudonyms, read_salt
 from nerg_mi.tracking.rays import TRACKING, Rays
 from nerg_mi.transport.observer import sensor_center
@@ -36,7 +37,6 @@ from .changes import open_changes
 from .estimates import MIN_FOR_INTERVAL
 from .measured import AoiContext, Counting, TimeWindow, count_block, iter_blocks
 from .moving import check_objects
-from .objects import ObjectPoses
 from .output import StatisticsResult, has_parquet
 from .placed import PlacedAreas, open_placed_areas
 from .power import power_rows
@@ -130,8 +130,8 @@ def statistics(
     zones : Areas, path or mapping, optional
         JSON file of boxes on the floor; attention is reported separately for observers in each box.
     objects : ObjectPoses or path, optional
-        Table with columns time,object,x,y,z,qw,qx,qy,qz (`nerg_mi.aoi.objects`): poses of shapes and areas that move,
-        in the frame of the rays; without x,y,z an object is absent. Predictions ignore them.
+        Table with columns time,object,x,y,z,qw,qx,qy,qz (`nerg_mi.tracking.objects`): poses of shapes and areas that
+        move, in the frame of the rays; without x,y,z an object is absent. Predictions ignore them.
     what_if : path or mapping, optional
         JSON file of changes to shapes and observers; the gaze field predicts their effect.
     observers : array_like of shape (M, 3), optional

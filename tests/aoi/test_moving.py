@@ -1,4 +1,4 @@
-"""Tests of `nerg_mi.aoi.moving` and `nerg_mi.aoi.objects`: a room whose objects move, against float64 NumPy."""
+"""Tests of `nerg_mi.aoi.moving` and `nerg_mi.tracking.objects`: a room whose objects move, against float64 NumPy."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from nerg_mi.aoi.moving import to_object_frame
-from nerg_mi.aoi.objects import ObjectPoses
 from nerg_mi.aoi.settings import AoiSampling, VisitRules
 from nerg_mi.aoi.statistics import statistics
 from nerg_mi.errors import NergError
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.tasks.settings import Parallel
+from nerg_mi.tracking.objects import ObjectPoses
 from nerg_mi.tracking.rays import Rays
 from tests.recorder import Recorder
 

@@ -162,7 +162,7 @@ class ObjectPoses:
 
     Examples
     --------
-    >>> from nerg_mi.aoi.objects import ObjectPoses
+    >>> from nerg_mi.tracking.objects import ObjectPoses
     >>> poses = ObjectPoses.from_arrays(["box"] * 3, [0, 1, 2], [[1, 0, 0], [1, 2, 0], [float("nan")] * 3])
     >>> poses
     <ObjectPoses: box, t 0 to 2 s>
@@ -228,7 +228,7 @@ class ObjectPoses:
 
     @classmethod
     def load(cls, path: FilePath, *, max_gap: float = MAX_GAP) -> ObjectPoses:
-        """Read a table of poses (`nerg_mi.aoi.objects`). Raises `NergError` for missing columns and invalid rows."""
+        """Read a table of poses as described above. Raises `NergError` for missing columns and invalid rows."""
         path = to_path(path)
         table = ColumnFinder(path)
         time, position = table.require_time("time", "t", "timestamp"), table.require_vector("", "position", "pos")
