@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from .aoi.areas import Areas
     from .aoi.attention import attention
     from .aoi.bids import export_rays
+    from .aoi.flat import draw_area
     from .aoi.robustness import robustness
     from .aoi.statistics import statistics
     from .environment.arrays import Camera
@@ -101,6 +102,7 @@ _MODULES = {
     "bake": "nerg_mi.surfaces.bake",
     "check_rays": "nerg_mi.tracking.quality",
     "compile_field": "nerg_mi.train.compile",
+    "draw_area": "nerg_mi.aoi.flat",
     "draw_difference": "nerg_mi.figures.image_files",
     "draw_floor": "nerg_mi.figures.floor_plans",
     "draw_scanpath": "nerg_mi.figures.scanpath",
@@ -166,6 +168,7 @@ __all__ = [
     "bake",
     "check_rays",
     "compile_field",
+    "draw_area",
     "draw_difference",
     "draw_floor",
     "draw_scanpath",

@@ -100,6 +100,7 @@ def test01_no_block_is_left_out():
         ("exchange.md", "py"),
     }
     here |= {("moving-objects.md", language) for language in ("text", "python")} | {("other-choices.md", "python")}
+    here |= {("flat-areas.md", "python")}
     here |= {(f"{page}.md", "json") for page in ("viewer", "store", "statistics")}
     here |= {
         (f"{page}.md", "python")
@@ -231,6 +232,14 @@ def test_objects_move(rgb, tmp_path):
     assert rows["box"] == pytest.approx(0.55, abs=0.03) and rows["box"] + rows["wall"] == pytest.approx(1)
     assert len(names["on_box"]) == pytest.approx(22, abs=1) and np.allclose(names["on_box"].hit[:, 0], 2.8, atol=1e-3)
     assert names["baked"].on_surface > 0.9
+
+
+def test_flat_areas(rgb):
+    (block,) = blocks("python", page="flat-areas.md")
+    names = run(block.text, block.page)
+    # The pillar hides what is less than 0.1 / 2.9 x 4.9 m from the middle.
+    assert len(names["gaze"].samples["t"]) == 40 and len(names["seen"]) == pytest.approx(30, abs=1)
+    assert len(names["figure"].axes) == 2
 
 
 def test_other_choices():

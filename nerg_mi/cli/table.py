@@ -199,6 +199,23 @@ TABLE = (
         without=("fov", "cut_height", "mode"),
     ),
     Row(
+        "draw area",
+        "nerg_mi.aoi.flat:draw_area",
+        "Draw the gaze on a flat area from its front, and write its coordinates there.",
+        ("inputs",),
+        _FIGURE,
+        (".png", ".svg", ".pdf", ".csv"),
+        {
+            "samples": ("CSV file to write: coordinates of each sample on the area. Default: not written.",),
+            "image": ("Picture of the area without gaze to write (.png). Default: not written.",),
+        },
+        suffices=True,
+        fastest=True,
+        spellings={"corners": ("--corner",)},
+        groups={INPUT: ("aois", "area", "corners", "align", "objects")},
+        without=("hatching", "log_decades", "mode"),
+    ),
+    Row(
         "draw sheet",
         "nerg_mi.figures.image_files:draw_sheet",
         "Draw several images on one page, with a common colour scale.",

@@ -105,10 +105,11 @@ def test_objects_and_results_have_the_same_methods():
     # Others are in memory only, or written by the function that returns them.
     results = {"Bake", "SplatBake", "ImportedFields", "MeasuredEvents", "RaysSplit", "Report", "StatisticsResult"}
     results |= {"StudyResult", "Surface", "SurfaceSplats", "TorchNgpModel", "FoldResult", "GazeEvaluation"}
-    results |= {"NextLookEvaluation", "ViewScores", "RobustnessResult"}
+    results |= {"NextLookEvaluation", "ViewScores", "RobustnessResult", "AreaGaze"}
     assert names_with("save") == files | results
     tables = {"Areas", "Attention", "FoldResult", "GazeEvaluation", "MeasuredEvents", "NextLookEvaluation", "Photos"}
     assert names_with("to_dataframe") == tables | {
+        "AreaGaze",
         "Rays",
         "RobustnessResult",
         "StatisticsResult",
