@@ -4,7 +4,8 @@
 
 NumPy, OpenBLAS and Dr.Jit select instructions by the processor, and results differ in their last bits. Here, they
 select those of a processor without AVX-512 or, where there is none, without AVX2. NumPy and OpenBLAS read this from the
-environment, also in child processes. Dr.Jit does not: `limit_drjit`, which the tests call, changes its process only.
+environment, also in child processes. Dr.Jit does not: `limit_drjit`, which tests and benchmarks call, changes its
+process only.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import nerg_mi  # noqa: F401 (selects libLLVM)
@@ -34,10 +36,10 @@ def make_environment() -> dict[str, str]:
     }
 
 
-def limit_drjit(width: int) -> None:
+def limit_drjit(width: int) -> Callable[[], None]:
     """Have Dr.Jit compile kernels with vectors of ``width`` floats and no instructions beyond AVX2, which it requires.
 
-    Dr.Jit exports this function to C++ only.
+    Dr.Jit exports this function to C++ only. Returns a function that undoes it.
     """
     import drjit
     import mitsuba as mi
@@ -47,11 +49,17 @@ def limit_drjit(width: int) -> None:
     # void jit_llvm_set_target(const char *cpu, const char *features, uint32_t vector_width)
     set_target = library["_Z19jit_llvm_set_targetPKcS0_j"]
     set_target.argtypes, set_target.restype = [ctypes.c_char_p, ctypes.c_char_p, ctypes.c_uint32], None
-    set_target(b"x86-64-v3", b"", width)
-    get_width = library["_Z21jit_llvm_vector_widthv"]
+    get_cpu, get_features, get_width = (
+        library[name]
+        for name in ("_Z19jit_llvm_target_cpuv", "_Z24jit_llvm_target_featuresv", "_Z21jit_llvm_vector_widthv")
+    )
+    get_cpu.restype = get_features.restype = ctypes.c_char_p
     get_width.restype = ctypes.c_uint32
+    before = get_cpu(), get_features(), get_width()
+    set_target(b"x86-64-v3", b"", width)
     if get_width() != width:
         raise RuntimeError(f"Dr.Jit uses vectors of {get_width()} floats, not {width}")
+    return lambda: set_target(*before)
 
 
 def main(command: list[str]) -> None:
