@@ -121,10 +121,15 @@ class RenderContext:
         offset = cast("Any", sampler).next_1d(active) if self.nerg.jitter else None
         return CameraView(self, scene, sensors, ray, active, offset, may_list)
 
-    def list_inputs(self, scene: mi.Scene, sensors: Sequence[mi.Sensor], lanes: int) -> list[Any]:
-        """All objects that ``lanes`` rays of ``sensors`` read, for a recording. Raises `NotRecordable`."""
+    def list_inputs(
+        self, scene: mi.Scene, sensors: Sequence[mi.Sensor], lanes: int, seen: SceneGeometry | None = None
+    ) -> list[Any]:
+        """All objects that ``lanes`` rays of ``sensors`` read, for a recording. Raises `NotRecordable`.
+
+        ``seen``: the geometry as seen from the camera. Default: that of a single one of ``sensors``.
+        """
         nerg = self.nerg
-        geometry = see_from_camera(SceneGeometry(nerg.medium, scene), sensors, count_pixels(sensors, lanes))
+        geometry = seen or see_from_camera(SceneGeometry(nerg.medium, scene), sensors, count_pixels(sensors, lanes))
         self.seen[:] = [geometry]
         inputs = list_geometry_inputs(geometry)
         if nerg.gaze is not None:

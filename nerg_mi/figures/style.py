@@ -74,7 +74,8 @@ PERIOD, WIDTH = 8, 2
 PALE, LINE = 0.82, 0.42
 """Display values of the grey that the image is blended with, and of the lines."""
 
-_PALE_FRACTION = 0.65
+PALE_FRACTION = 0.65
+"""Weight of that grey."""
 
 
 def hatch_lines(height: int, width: int, unit: int = 1) -> np.ndarray:
@@ -87,7 +88,7 @@ def hatch(display: Any, unknown: Any, unit: int = 1) -> np.ndarray:
     """Hatch ``display`` values (h, w, 3) where ``unknown`` (h, w) is true."""
     shown = np.asarray(display, np.float64)
     where = np.asarray(unknown, bool)[..., None]
-    pale = shown + _PALE_FRACTION * (PALE - shown)
+    pale = shown + PALE_FRACTION * (PALE - shown)
     height, width = shown.shape[:2]
     hatched = np.where(hatch_lines(height, width, unit)[..., None], LINE, pale)
     return np.where(where, hatched, shown)

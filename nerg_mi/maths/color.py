@@ -26,6 +26,12 @@ def decode_srgb(srgb: np.ndarray) -> np.ndarray:
     return np.where(srgb <= 0.04045, srgb / 12.92, ((np.maximum(srgb, 0.04045) + 0.055) / 1.055) ** 2.4)
 
 
+def linear_to_srgb(c):
+    """sRGB values of linear values from 0 to 1 in a Dr.Jit array."""
+    power: Any = dr.power(dr.maximum(c, 0.0031308), 1 / 2.4)
+    return dr.select(c <= 0.0031308, 12.92 * c, 1.055 * power - 0.055)
+
+
 def srgb_to_linear(c):
     """Linear values of sRGB values in a Dr.Jit array, per component; differentiable."""
     low = c <= 0.04045

@@ -221,11 +221,8 @@ FRAME_SECONDS = 1 / 15
 MAX_FRAME_SECONDS = 0.1
 """Maximum time of a frame, in seconds; slower movements are shown by points."""
 
-_FRAME_COLOR_CUTOFF = 0.5
-"""`MarchSettings.color_cutoff` of frames of a compiled field: colour takes most of their time."""
-
-_FRAME_OVERHEAD = 0.02
-"""Time of a frame that does not depend on its size, in seconds: kernels are assembled and started."""
+_FRAME_OVERHEAD = 0.006
+"""Time of a frame that does not depend on its size, in seconds: kernels are started, and the image is encoded."""
 
 FRAME_WIDTHS = (640, 480, 320, 240)
 """The possible widths of the frames of a movement, in pixels."""
@@ -241,49 +238,18 @@ class FramePace:
         """Record that ``num_rays`` rays took ``seconds``."""
         self._ray_seconds.append(max(seconds - _FRAME_OVERHEAD, 0.1 * seconds) / num_rays)
 
+    def estimate(self, num_rays: int) -> float:
+        """Return the expected seconds of a frame of ``num_rays`` rays; infinite if the speed of rays is unknown."""
+        if len(self._ray_seconds) < 2:
+            return math.inf
+        # The median: single times contain the compilation of a kernel.
+        return _FRAME_OVERHEAD + float(np.median(self._ray_seconds)) * num_rays
+
     def choose_width(self, view: PinholeView, max_width: int) -> int | None:
         """Return the width of the next frame of ``view``; None if rays are too slow for frames, or of unknown speed."""
-        if len(self._ray_seconds) < 2:
-            return None
-        # The median: single times contain the compilation of a kernel.
-        ray_seconds = float(np.median(self._ray_seconds))
-        seconds = {
-            w: _FRAME_OVERHEAD + ray_seconds * w * view.picture_height(w) for w in FRAME_WIDTHS if w <= max_width
-        }
+        seconds = {w: self.estimate(w * view.picture_height(w)) for w in FRAME_WIDTHS if w <= max_width}
         fast = [w for w in seconds if seconds[w] <= FRAME_SECONDS] or list(seconds)[-1:]
         return fast[0] if fast and seconds[fast[0]] <= MAX_FRAME_SECONDS else None
-
-
-def render_frame(
-    scene: Scene,
-    view: PinholeView,
-    observer: np.ndarray | None,
-    quantities: Sequence[str],
-    width: int,
-    pace: FramePace,
-    *,
-    ceiling: Ceiling | None = None,
-) -> StagePicture:
-    """Render a picture of ``width`` pixels with one sample per pixel at once. Arguments as for `refine`.
-
-    Of a compiled field the colour is evaluated at one or two positions per ray.
-    """
-    start, integrator = time.perf_counter(), scene.integrator
-    settings = integrator.settings
-    if integrator.medium is not None and integrator.medium.is_density_separate:
-        settings = replace(settings, color_cutoff=max(settings.color_cutoff, _FRAME_COLOR_CUTOFF))
-    shape = view.picture_height(width), width
-    directions = view.ray_directions(width, shape[0], np.full((shape[0] * width, 2), 0.5))
-    with (
-        rough_integrals(scene),
-        override_attribute(scene, "ceiling", ceiling),
-        override_attribute(scene, "settings", settings),
-    ):
-        traced = _trace_from(scene, view.origin, directions, quantities, observer, 0)
-    seconds = time.perf_counter() - start
-    pace.record(seconds, len(directions))
-    values = {name: v.reshape(*shape, *v.shape[1:]) for name, v in traced.items()}
-    return StagePicture(values, 1, seconds, 1, False)
 
 
 def refine(
@@ -296,7 +262,6 @@ def refine(
     pace: BandPace,
     *,
     ceiling: Ceiling | None = None,
-    frame_pace: FramePace | None = None,
     min_width: int = 0,
     seed: int = 0,
 ) -> Iterator[StagePicture | None]:
@@ -320,8 +285,6 @@ def refine(
         Chooses the size of the bands.
     ceiling : Ceiling or None
         The part of the scene to hide in views from above; it replaces the ceiling of the scene.
-    frame_pace : FramePace or None
-        Learns from the first pictures how fast frames would be.
     min_width : int
         Pictures that are not wider are left out, except the final one.
     seed : int
@@ -356,10 +319,7 @@ def refine(
                         scene, view.origin, pad_directions(part, size), quantities, observer, band_seed
                     )
                 parts.append({name: v[: len(part)] for name, v in traced.items()})
-                seconds = time.perf_counter() - band_start
-                pace.record(seconds)
-                if frame_pace is not None and downsampling > 1:
-                    frame_pace.record(seconds, size)
+                pace.record(time.perf_counter() - band_start)
                 done += len(part)
                 yield None
             values = {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}

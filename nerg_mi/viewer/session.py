@@ -31,8 +31,10 @@ from nerg_mi.transport.geometry import Ceiling
 
 from . import layers
 from .compilation import BackgroundCompilation, find_compiled_file, is_current
+from .frames import render_frame
 from .layers import DisplaySettings, Layer, Scale
 from .points import (
+    BAND_SECONDS,
     BAND_SIZES,
     FRAME_WIDTHS,
     BandPace,
@@ -48,7 +50,6 @@ from .points import (
     make_heading,
     pad_directions,
     refine,
-    render_frame,
 )
 from .shares import AttentionShare, iter_attention_shares
 from .source import ViewerInputs
@@ -154,6 +155,8 @@ class Session:
         self.regions: list[Region] = []
         self.other_areas: list[Area] = []
         self.band_pace, self.frame_pace = BandPace(), FramePace()
+        # The observer of the last frame.
+        self._last_observer: np.ndarray | None = None
         # The volume of the compiled radiance field, and the process that compiles it.
         self.compiled: Any = None
         self._compilation: BackgroundCompilation | None = None
@@ -218,10 +221,7 @@ class Session:
             self._set_falloff()
             self.frame_pace = FramePace()
             yield
-            # Compile the kernels now, and measure the time of rays.
-            for _ in range(3):
-                self._make_frame(self.home_view, FRAME_WIDTHS[-1])
-                yield
+            yield from self._time_frames(self.home_view)
 
         self.worker.submit("compiled", FRAME_PRIORITY, steps())
 
@@ -457,9 +457,7 @@ class Session:
         min_width : int
             Pictures that are not wider are left out.
         """
-        self.worker.submit(
-            ("picture", name), NORMAL_PRIORITY, self._refine(view, deliver, width, spp, min_width=min_width)
-        )
+        self.worker.submit(("picture", name), NORMAL_PRIORITY, self._refine_view(view, deliver, width, spp, min_width))
 
     def choose_frame_width(self, view: PinholeView) -> int | None:
         """Return the width of frames of ``view`` during a movement; None if rendering is too slow for them."""
@@ -485,14 +483,16 @@ class Session:
 
         self.worker.submit(("frame", name), FRAME_PRIORITY, steps())
 
-    def _make_frame(self, view: PinholeView, width: int) -> tuple[StagePicture, np.ndarray]:
+    def _make_frame(self, view: PinholeView, width: int, is_draft: bool = True) -> tuple[StagePicture, np.ndarray]:
         with self.lock:
             display, observer, height = self.display, self.observer, self.ceiling
-        ceiling = None if height is None else Ceiling(height, self.ceiling_up)
-        layer = display.layer
-        quantities = layers.required_quantities(layer)
-        picture = render_frame(self.scene, view, observer, quantities, width, self.frame_pace, ceiling=ceiling)
-        return picture, self._colorize(layer, picture)
+        options = {
+            "ceiling": None if height is None else Ceiling(height, self.ceiling_up),
+            "is_draft": is_draft,
+            "is_observer_at_rest": observer is self._last_observer,
+        }
+        self._last_observer = observer
+        return render_frame(self.scene, view, observer, display.layer, self.scale(), width, self.frame_pace, **options)
 
     def _colorize(self, layer: Layer, picture: StagePicture) -> np.ndarray:
         values = layer.select_values(picture.values)
@@ -622,6 +622,29 @@ class Session:
         deliver(position if corrected is None else corrected)
         yield None
 
+    def _refine_view(
+        self,
+        view: PinholeView,
+        deliver: Callable[[StagePicture, np.ndarray], None],
+        width: int,
+        spp: int,
+        min_width: int,
+    ) -> Iterator[None]:
+        """Refine the picture of a browser, beginning with one of the full width if that is fast."""
+        if self.has_scale and self.frame_pace.estimate(width * view.picture_height(width)) <= BAND_SECONDS:
+            deliver(*self._make_frame(view, width, is_draft=False))
+            min_width = width
+            yield None
+        yield from self._refine(view, deliver, width, spp, min_width=min_width)
+        yield from self._time_frames(view)
+
+    def _time_frames(self, view: PinholeView) -> Iterator[None]:
+        """Compile the kernels of frames, and measure the time of their rays, unless they are known to be fast."""
+        if self.settings.width >= FRAME_WIDTHS[-1] and self.choose_frame_width(view) is None:
+            for _ in range(3):
+                self._make_frame(view, FRAME_WIDTHS[-1])
+                yield None
+
     def _refine(
         self,
         view: PinholeView,
@@ -636,7 +659,7 @@ class Session:
             display, observer, height = self.display, self.observer, self.ceiling
         ceiling = None if height is None else Ceiling(height, self.ceiling_up)
         layer, quantities = display.layer, layers.required_quantities(display.layer)
-        settings = {"ceiling": ceiling, "frame_pace": self.frame_pace, "min_width": min_width}
+        settings = {"ceiling": ceiling, "min_width": min_width}
         for picture in refine(self.scene, view, observer, quantities, width, spp, self.band_pace, **settings):
             if picture is not None:
                 mask = picture.values["opacity"] > 0.5

@@ -7,7 +7,6 @@ import threading
 import time
 
 import drjit.llvm.ad as ns
-import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
@@ -144,8 +143,7 @@ def test_a_moving_view_shows_frames_if_they_are_fast(room, gaze_fields, make_ses
     assert session.worker.wait_idle(120) and not window.is_frame_pending and window.shows_picture
     first = client.scene.pictures[0]
     assert len(client.scene.pictures) == 2 and first == (session.home_view.picture_height(320), 320, 3)
-    frame = window.last_picture[0].values
-    assert np.isfinite(frame["gaze"]).all() and frame["gaze"].max() > 0
+    assert window.last_picture[1].std() > 5
     # A frame that is late does not replace the pictures of a view at rest.
     set_speed(1e-9)
     page._hide_picture(window, time.monotonic())
