@@ -31,12 +31,12 @@ from nerg_mi.tracking.dataset import open_rays
 from nerg_mi.tracking.events import detect_fixations_ivt, warn_unknown_tracking
 from nerg_mi.tracking.rays import TRACKING, Rays
 
-from .areas import AnyAreas, Areas, to_json_values
+from .areas import AnyAreas, Areas
 from .measured import AoiContext, Counting, count_block, iter_blocks
 from .placed import PlacedAreas, open_placed_areas, place_areas
 from .robustness_output import Conclusion, RobustnessResult, conclusion_rows
 from .settings import AoiSampling, Choices, TrackerError, VisitRules
-from .statistics import make_windows, open_inputs
+from .statistics import open_counting, open_inputs
 from .statistics_parts import PlannedAreas, read_sums, save_objects, write_sums
 from .tables import MEASURES_BY_NAME, Pair, Participants, Row
 from .visits import ALL, Cell, VisitSums, merge_sums
@@ -336,18 +336,8 @@ def robustness(
     if chosen.rays is None or chosen.gaze is not None:
         raise NergError("choices are varied in the analysis of recordings: give rays and no gaze field")
     areas = Areas.open(aois, "aois")
-    zones = to_json_values(zones) if isinstance(zones, Mapping) else zones
-    zone_areas = None if zones is None else Areas.open(zones, "zones")
-    counting = Counting(
-        rules,
-        make_windows(windows or {}),
-        () if zone_areas is None else tuple(Areas.open_boxes(zone_areas, "zones")),
-        None if cohorts is None else to_path(cohorts),
-        error=error,
-        validation=None if validation is None else to_path(validation),
-    )
-    files = existing_files(*chosen, *areas.files, align, cohorts, validation)
-    files += [] if zone_areas is None else zone_areas.files
+    counting, counting_files = open_counting(Counting(rules, error=error), windows, zones, cohorts, validation)
+    files = [*existing_files(*chosen, *areas.files, align), *counting_files]
     matrix = None if align is None else open_similarity(align, "rays to scene").matrix.tolist()
     if align is not None and not isinstance(align, (str, os.PathLike)):
         changed["align"] = matrix

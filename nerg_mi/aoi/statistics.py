@@ -198,24 +198,14 @@ def statistics(
     chosen, align = open_inputs(inputs, align)
     areas = Areas.open(aois, "aois")
     zones = to_json_values(zones) if isinstance(zones, Mapping) else zones
-    zone_areas = None if zones is None else Areas.open(zones, "zones")
     what_if = to_json_values(what_if) if isinstance(what_if, Mapping) else what_if
     if align is not None and not isinstance(align, (str, os.PathLike)):
         align = open_similarity(align, "rays to scene").matrix.tolist()
     eyes = None if observers is None else _check_observers(observers)
-    counting = Counting(
-        rules,
-        make_windows(windows or {}),
-        () if zone_areas is None else tuple(Areas.open_boxes(zone_areas, "zones")),
-        None if cohorts is None else to_path(cohorts),
-        aoi_visibility,
-        fov,
-        error,
-        None if validation is None else to_path(validation),
-        None if objects is None else ObjectPoses.open(objects),
-    )
-    files = existing_files(*chosen, *areas.files, what_if, align, cohorts, validation, objects)
-    files += [] if zone_areas is None else zone_areas.files
+    poses = None if objects is None else ObjectPoses.open(objects)
+    plain_counting = Counting(rules, aoi_visibility=aoi_visibility, fov=fov, error=error, objects=poses)
+    counting, counting_files = open_counting(plain_counting, windows, zones, cohorts, validation)
+    files = [*existing_files(*chosen, *areas.files, what_if, align, objects), *counting_files]
     plain = {
         "aois": areas.path or (str(aois) if isinstance(aois, (str, os.PathLike)) else None),
         "zones": zones.path if isinstance(zones, Areas) else zones,
@@ -268,7 +258,28 @@ def statistics(
     return replace(result, num_suppressed=num_suppressed, provenance=provenance)
 
 
-def make_windows(windows: Mapping[str, Sequence[float]]) -> tuple[TimeWindow, ...]:
+def open_counting(
+    counting: Counting,
+    windows: Mapping[str, Sequence[float]] | None,
+    zones: FilePath | AnyAreas | None,
+    cohorts: FilePath | None,
+    validation: FilePath | None,
+) -> tuple[Counting, list[Path]]:
+    """Return ``counting`` with these time windows, zones, cohorts and errors, and the files that they are in."""
+    opened = None
+    if zones is not None:
+        opened = Areas.open(to_json_values(zones) if isinstance(zones, Mapping) else zones, "zones")
+    counting = replace(
+        counting,
+        windows=_make_windows(windows or {}),
+        zones=() if opened is None else tuple(Areas.open_boxes(opened, "zones")),
+        cohorts=None if cohorts is None else to_path(cohorts),
+        validation=None if validation is None else to_path(validation),
+    )
+    return counting, existing_files(cohorts, validation, *(() if opened is None else opened.files))
+
+
+def _make_windows(windows: Mapping[str, Sequence[float]]) -> tuple[TimeWindow, ...]:
     made = []
     for name, values in windows.items():
         ends = to_numbers(values, f"the time window {name!r}").ravel().tolist()
