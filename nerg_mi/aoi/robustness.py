@@ -1,10 +1,11 @@
-"""Robustness of conclusions: AOI statistics repeated with other choices of filters, areas, alignment and weighting."""
+"""Robustness of conclusions: AOI statistics, of recordings or predicted by gaze fields, repeated with other choices."""
 
 from __future__ import annotations
 
+import copy
 import os
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from itertools import combinations
 from pathlib import Path
@@ -12,10 +13,13 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from nerg_mi.environment.planned import PlannedFiles
+from nerg_mi.environment.gaze import GazeField, find_environment_record
+from nerg_mi.environment.inputs import find_role
 from nerg_mi.environment.scene_loading import activate_mitsuba
 from nerg_mi.errors import NergError, parameter
+from nerg_mi.fields.gaze_base import GazeNetwork
 from nerg_mi.figures.style import changed_arguments, existing_files, make_provenance
+from nerg_mi.files.atomic import make_folder
 from nerg_mi.files.values import FilePath, to_path
 from nerg_mi.formats.alignments import Alignment, AnySimilarity, open_similarity
 from nerg_mi.formats.boxes import Region
@@ -26,19 +30,30 @@ from nerg_mi.ranges import SEEDS, Range, check_ranges
 from nerg_mi.tasks.execution import prepare_once
 from nerg_mi.tasks.parts import PartRunner
 from nerg_mi.tasks.settings import Parallel
-from nerg_mi.tasks.task import RENDER_LIBRARIES, FileGroup, Part, Plan
-from nerg_mi.tracking.dataset import open_rays
+from nerg_mi.tasks.task import Part
+from nerg_mi.tracking.dataset import open_rays, open_recordings
 from nerg_mi.tracking.events import detect_fixations_ivt, warn_unknown_tracking
 from nerg_mi.tracking.rays import TRACKING, Rays
+from nerg_mi.transport.observer_gaze import GazeFieldInstance
 
 from .areas import AnyAreas, Areas
 from .measured import AoiContext, Counting, count_block, iter_blocks
 from .placed import PlacedAreas, open_placed_areas, place_areas
+from .predicted import PredictedAttention, Viewpoints, aggregate_by_participant, predict_attention
 from .robustness_output import Conclusion, RobustnessResult, conclusion_rows
-from .settings import AoiSampling, Choices, TrackerError, VisitRules
-from .statistics import open_counting, open_inputs
-from .statistics_parts import PlannedAreas, read_sums, save_objects, write_sums
-from .tables import MEASURES_BY_NAME, Pair, Participants, Row
+from .settings import AoiSampling, Choices, ObserverGrid, TrackerError, VisitRules
+from .statistics import AttentionAnalysis, list_inputs, open_counting, open_inputs
+from .statistics_parts import (
+    ObserverPoses,
+    PartitionedStatistics,
+    PlannedAreas,
+    read_prediction,
+    read_sums,
+    save_objects,
+    write_prediction,
+    write_sums,
+)
+from .tables import MEASURED, MEASURES_BY_NAME, PREDICTED, MinParticipantsFilter, Pair, Participants, Row
 from .visits import ALL, Cell, VisitSums, merge_sums
 
 # ---- Choices ----
@@ -53,21 +68,59 @@ neighbours in the order of the reference are, and of more values, the first ones
 MAX_SHRINKAGE = 0.45  # of the extent of a box, at each of its sides
 
 
-def draw_choices(choices: Choices, rng: np.random.Generator) -> Row:
-    """Draw the choices of one analysis, by name; those that depend on another choice are None if it excludes them."""
+NUM_WEIGHTS = 5
+"""Number of weights of the prior that are drawn from. Each compiles kernels of its own."""
+
+People = Mapping[Cell, Sequence[Participants]]
+"""Participants by cell: as recorded or predicted, and then with each random error of the tracker."""
+
+
+def draw_choices(choices: Choices, names: Container[str], num_fields: int, rng: np.random.Generator) -> Row:
+    """Draw the choices of one analysis that are in ``names``, and one of ``num_fields`` fields; those that depend on
+    another choice are None if it excludes them."""
     choice: Row = {}
-    for field in fields(choices):
-        value = getattr(choices, field.name)
-        if field.name in ("rotation", "shift"):
-            names = [field.name] if field.name == "rotation" else ["shift_x", "shift_y", "shift_z"]
-            choice |= {name: float(rng.uniform(-1, 1)) * (value or 0.0) for name in names}
+    for name in (f.name for f in fields(choices)):
+        value = getattr(choices, name)
+        if name in ("rotation", "shift"):
+            axes = [name] if name == "rotation" else ["shift_x", "shift_y", "shift_z"]
+            choice |= {axis: float(rng.uniform(-1, 1)) * (value or 0.0) for axis in axes}
+        elif name not in names:
+            continue
+        elif name == "prior_weight":
+            choice[name] = None if value is None else float(rng.choice(np.linspace(*value, NUM_WEIGHTS)))
         elif isinstance(value[0], str):
-            choice[field.name] = value[int(rng.integers(len(value)))]
+            choice[name] = value[int(rng.integers(len(value)))]
         else:
-            choice[field.name] = float(rng.uniform(*value))
-    if choice["samples"] == "all":
+            choice[name] = float(rng.uniform(*value))
+    if choice.get("samples") == "all":
         choice |= {"velocity": None, "min_fixation": None}
-    return choice
+    return choice | ({"field": int(rng.integers(num_fields)) + 1} if num_fields else {})
+
+
+def find_motion(choice: Mapping[str, Any], center: np.ndarray, scale: float) -> np.ndarray:
+    """Return the motion (4, 4) of the tracking in the scene: a rotation about ``center`` and a shift."""
+    cos, sin = np.cos(np.radians(choice["rotation"])), np.sin(np.radians(choice["rotation"]))
+    motion = np.eye(4)
+    motion[:2, :2] = [[cos, -sin], [sin, cos]]
+    shift = scale * np.array([choice[f"shift_{axis}"] for axis in "xyz"])
+    motion[:3, 3] = center - motion[:3, :3] @ center + shift
+    return motion
+
+
+def change_areas(placed: PlacedAreas, choice: Mapping[str, Any]) -> tuple[Areas, AoiSampling]:
+    """Return the areas and tolerances of a choice."""
+    growth = choice["growth"] * placed.scale
+    areas = tuple(_grow(a, growth) if isinstance(a, Region) else a for a in placed.areas.areas)
+    tolerance = choice.get("tolerance", placed.sampling.tolerance)
+    sampling = replace(placed.sampling, tolerance=tolerance, margin=choice["margin"])
+    return replace(placed.areas, areas=areas), sampling
+
+
+def _grow(box: Region, growth: float) -> Region:
+    """Move the sides of a box outwards, or inwards by at most `MAX_SHRINKAGE`."""
+    lower, upper = box.corners
+    step = np.maximum(growth, -MAX_SHRINKAGE * (upper - lower))
+    return replace(box, lower=tuple((lower - step).tolist()), upper=tuple((upper + step).tolist()))
 
 
 # ---- Analyses ----
@@ -101,7 +154,7 @@ class Analyses:
         reference |= {"weighting": "participants", "samples": "all", "velocity": None, "min_fixation": None}
         return reference | {"tracker": "corrected" if self.counting.has_error else "ignored"}
 
-    def count(self, choice: Mapping[str, Any]) -> VisitSums:
+    def compute(self, choice: Mapping[str, Any]) -> VisitSums:
         """Sum the visits with these choices."""
         rays = self.rays
         if choice["samples"] == "fixations":
@@ -114,25 +167,71 @@ class Analyses:
         return merge_sums(count_block(block, context) for block in iter_blocks(rays, rules))
 
     def _place(self, choice: Mapping[str, Any]) -> PlacedAreas:
-        placed = self.placed
-        shift = placed.scale * np.array([choice[f"shift_{axis}"] for axis in "xyz"])
-        cos, sin = np.cos(np.radians(choice["rotation"])), np.sin(np.radians(choice["rotation"]))
-        motion = np.eye(4)
-        motion[:2, :2] = [[cos, -sin], [sin, cos]]
-        motion[:3, 3] = self.center - motion[:3, :3] @ self.center + shift
-        align = Similarity(motion @ placed.environment.align.matrix)
-        growth = choice["growth"] * placed.scale
-        areas = tuple(_grow(a, growth) if isinstance(a, Region) else a for a in placed.areas.areas)
-        sampling = replace(placed.sampling, tolerance=choice["tolerance"], margin=choice["margin"])
-        environment = replace(placed.environment, align=align)
-        return place_areas(environment, None, replace(placed.areas, areas=areas), placed.meshes, sampling)
+        placed, (areas, sampling) = self.placed, change_areas(self.placed, choice)
+        align = Similarity(find_motion(choice, self.center, placed.scale) @ placed.environment.align.matrix)
+        return place_areas(replace(placed.environment, align=align), None, areas, placed.meshes, sampling)
+
+    def find_people(self, sums: VisitSums, choice: Mapping[str, Any]) -> People:
+        """Return the participants of an analysis."""
+        draws = [sums.select_draw(draw) for draw in range(1 + max(cell.draw for cell in sums.cells))]
+        return {cell: [Participants.from_sums(of_draw, cell, False) for of_draw in draws] for cell in draws[0].cells}
 
 
-def _grow(box: Region, growth: float) -> Region:
-    """Move the sides of a box outwards, or inwards by at most `MAX_SHRINKAGE`."""
-    lower, upper = box.corners
-    step = np.maximum(growth, -MAX_SHRINKAGE * (upper - lower))
-    return replace(box, lower=tuple((lower - step).tolist()), upper=tuple((upper + step).tolist()))
+@dataclass(frozen=True, eq=False)
+class Predictions:
+    """Predicts attention with other choices: of ``viewpoints`` in the ``placed`` areas, recorded or not, by one of the
+    ``networks`` (`list_networks`). ``times`` are the recorded seconds of each participant by cell."""
+
+    placed: PlacedAreas
+    networks: Sequence[GazeNetwork]
+    viewpoints: Viewpoints
+    is_recorded: bool
+    times: Mapping[Cell, dict[str, float]] = field(default_factory=dict)
+
+    def get_reference(self) -> Row:
+        """Return the choices of the reference, by name."""
+        sampling = self.placed.sampling
+        reference: Row = {"margin": sampling.margin, "growth": 0.0, "glance_duration": sampling.glance_duration}
+        reference |= dict.fromkeys(("rotation", "shift_x", "shift_y", "shift_z"), 0.0)
+        return reference | {"weighting": "participants", "prior_weight": None, "field": 0}
+
+    def compute(self, choice: Mapping[str, Any]) -> PredictedAttention:
+        """Predict the attention with these choices. The field is moved with the tracking that it was trained on."""
+        placed, viewpoints, network = self.placed, self.viewpoints, self.networks[choice["field"]]
+        assert placed.sampler is not None
+        if choice["prior_weight"] not in (None, network.config.mix):
+            network = copy.copy(network.members[0])
+            network.set_prior(choice["prior_weight"])
+        motion = find_motion(choice, viewpoints.positions.mean(axis=0), placed.scale)
+        moved = GazeFieldInstance(network, Similarity(motion @ placed.sampler.gaze.to_world.matrix))
+        areas, sampling = change_areas(placed, choice)
+        sampler = replace(placed.sampler, gaze=moved)
+        placed = place_areas(placed.environment, sampler, areas, placed.meshes, sampling)
+        if self.is_recorded:
+            positions = viewpoints.positions @ motion[:3, :3].T + motion[:3, 3]
+            viewpoints = replace(viewpoints, positions=positions)
+        return predict_attention(placed, viewpoints, fov=360.0)  # no measure here depends on the field of view
+
+    def find_people(self, predicted: PredictedAttention, choice: Mapping[str, Any]) -> People:
+        """Return the participants of an analysis."""
+        duration, people = choice["glance_duration"], {}
+        for cell, times in self.times.items():
+            of_cell = aggregate_by_participant(predicted, self.viewpoints, cell, times, duration)
+            if of_cell is not None:
+                people[cell] = [of_cell]
+        return people
+
+
+def list_networks(gaze_fields: Sequence[GazeField]) -> list[GazeNetwork]:
+    """Return the network of the first field, which is that of the reference, and each member of all fields alone."""
+    networks = [gaze_fields[0].network]
+    for network in (gaze_field.network for gaze_field in gaze_fields):
+        for member in network.members:
+            alone = copy.copy(member)
+            # Those of an ensemble belong to it as a whole.
+            alone.hits, alone.support, alone.basis = network.hits, network.support, network.basis
+            networks.append(alone)
+    return networks
 
 
 @dataclass(frozen=True)
@@ -151,7 +250,29 @@ class PlannedAnalyses:
 def count_analysis(common: PlannedAnalyses, choice: Mapping[str, Any], output: Path) -> None:
     """Write the sums (.npz) of one analysis."""
     analyses: Analyses = prepare_once(common, common.open)
-    write_sums(output, [analyses.count(choice)])
+    write_sums(output, [analyses.compute(choice)])
+
+
+@dataclass(frozen=True)
+class PlannedPredictions:
+    """Common arguments of all parts: the ``areas``, the files of ``gaze_fields``, and what `Predictions` has."""
+
+    areas: PlannedAreas
+    gaze_fields: tuple[Path, ...]
+    poses: ObserverPoses
+    is_recorded: bool
+
+    def open(self) -> Predictions:
+        """Load the files."""
+        placed = self.areas.open()
+        networks = list_networks([GazeField.load(file) for file in self.gaze_fields])
+        return Predictions(placed, networks, self.poses.to_viewpoints(), self.is_recorded)
+
+
+def predict_analysis(common: PlannedPredictions, choice: Mapping[str, Any], output: Path) -> None:
+    """Write the predicted attention (.npz) of one analysis."""
+    predictions: Predictions = prepare_once(common, common.open)
+    write_prediction(output, predictions.compute(choice))
 
 
 # ---- Conclusions ----
@@ -159,19 +280,22 @@ def count_analysis(common: PlannedAnalyses, choice: Mapping[str, Any], output: P
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Evaluates conclusions from the sums of an analysis; ``is_single`` (A,) are the areas that are no groups."""
+    """Evaluates conclusions from the participants of an analysis; ``areas`` (A,) are names, and ``is_single`` (A,) the
+    areas that are no groups."""
 
+    areas: Sequence[str]
     is_single: np.ndarray
-    draws: int
     resamples: int
     seed: int
 
-    def rank(self, sums: VisitSums, choice: Row) -> dict[str, np.ndarray]:
-        """Return the ranks (A,) of the areas from 1, the largest value, by measure; equal values share the mean of
-        their ranks, and groups have the rank infinity."""
+    def rank(self, people: People, choice: Row) -> dict[str, np.ndarray]:
+        """Return the ranks (A,) of the areas from 1, the largest value, by measure that the analysis has; equal values
+        share the mean of their ranks, and groups have the rank infinity."""
         ranks = {}
         for measure in MEASURES:
-            x, y = self._pair(sums, choice, measure, ALL)
+            if MEASURES_BY_NAME[measure].numerator_denominator(people[ALL][0]) is None:  # as visits of a prediction
+                continue
+            x, y = self._pair(people[ALL], choice, measure)
             value = np.where(self.is_single, x.sum(axis=0) / np.maximum(y.sum(axis=0), 1e-300), -np.inf)
             is_equal = np.isclose(value, value[:, None], rtol=1e-9, atol=0)
             rank = 0.5 + ((value > value[:, None]) & ~is_equal).sum(axis=1) + 0.5 * is_equal.sum(axis=1)
@@ -179,26 +303,28 @@ class Evaluation:
         return ranks
 
     def evaluate(
-        self, sums: VisitSums, choice: Row, ranks: Mapping[str, np.ndarray]
+        self, people: People, choice: Row, ranks: Mapping[str, np.ndarray]
     ) -> dict[Conclusion, tuple[float, float, float]]:
         """Return differences, or ranks, with the limits of their intervals (NaN without one); ``ranks`` are those of
         the reference."""
-        names, values = sums.areas, {}
-        own_ranks = self.rank(sums, choice)
+        values: dict[Conclusion, tuple[float, float, float]] = {}
+        own_ranks = self.rank(people, choice)
         for measure, reference in ranks.items():
             order = np.argsort(reference, kind="stable")[: self.is_single.sum()]
             pairs = list(combinations(order, 2) if len(order) <= MAX_PAIRED else zip(order[:-1], order[1:]))
             if pairs:
-                x, y = self._pair(sums, choice, measure, ALL)
+                x, y = self._pair(people[ALL], choice, measure)
                 a, b = np.array(pairs).T
-                keys = [Conclusion("areas", measure, names[i], names[j]) for i, j in pairs]
+                keys = [Conclusion("areas", measure, self.areas[i], self.areas[j]) for i, j in pairs]
                 values |= dict(zip(keys, self._subtract(measure, (x[:, a], y[:, a]), (x[:, b], y[:, b]))))
             for place, k in enumerate(order[:3], 1):
-                values[Conclusion("rank", measure, names[k], place)] = (own_ranks[measure][k], np.nan, np.nan)
-            for first, second in _pair_cells(sums.cells):
-                people = sorted({person for cell, person in sums.rows if cell in (first, second)})
-                one, other = (self._pair(sums, choice, measure, cell, people) for cell in (first, second))
-                keys = [Conclusion("cells", measure, first, second, name) for name in names]
+                values[Conclusion("rank", measure, self.areas[k], place)] = (own_ranks[measure][k], np.nan, np.nan)
+            for first, second in _pair_cells(people):
+                names = sorted({*people[first][0].names, *people[second][0].names})
+                one, other = (
+                    self._pair([p.align_to(names) for p in people[cell]], choice, measure) for cell in (first, second)
+                )
+                keys = [Conclusion("cells", measure, first, second, area) for area in self.areas]
                 values |= dict(zip(keys, self._subtract(measure, one, other)))
         return values
 
@@ -206,32 +332,27 @@ class Evaluation:
         d = MEASURES_BY_NAME[measure].estimate_differences(second, first, self.resamples, self.seed)
         return zip(d.value.tolist(), d.low.tolist(), d.high.tolist())
 
-    def _pair(
-        self, sums: VisitSums, choice: Row, measure: str, cell: Cell, people: Sequence[str] | None = None
-    ) -> Pair:
-        """Return numerators and denominators (P, A) over the participants of a cell, or over ``people``."""
-        is_corrected = choice["tracker"] == "corrected"
-        x, y = [], np.empty(0)
-        for draw in range(2 * self.draws + 1 if is_corrected else 1):
-            p = Participants.from_sums(sums.select_draw(draw), cell, False)
-            p = p if people is None else p.align_to(people)
+    def _pair(self, draws: Sequence[Participants], choice: Row, measure: str) -> Pair:
+        """Return numerators and denominators (P, A) over participants."""
+        pairs = []
+        for p in draws:
             if measure == "share" and choice["weighting"] == "time":
                 pair: Pair | None = p.dwell_time, p.ones * p.time[:, None]
             else:
                 pair = MEASURES_BY_NAME[measure].numerator_denominator(p)
             assert pair is not None
-            x.append(pair[0])
-            y = pair[1]
-        if not is_corrected:
-            return x[0], y
+            pairs.append(pair)
+        if len(pairs) == 1:
+            return pairs[0]
         # To no error, as in `nerg_mi.aoi.tracker_error`; denominators are those of the samples without an added error.
-        once, twice = np.mean(x[1 : self.draws + 1], axis=0), np.mean(x[self.draws + 1 :], axis=0)
-        return 3 * x[0] - 3 * once + twice, y
+        half = len(pairs) // 2
+        once, twice = (np.mean([x for x, _ in part], axis=0) for part in (pairs[1 : half + 1], pairs[half + 1 :]))
+        return 3 * pairs[0][0] - 3 * once + twice, pairs[0][1]
 
 
-def _pair_cells(cells: Sequence[Cell]) -> list[tuple[Cell, Cell]]:
+def _pair_cells(cells: Iterable[Cell]) -> list[tuple[Cell, Cell]]:
     """Return pairs of cells of the same dimension."""
-    recorded = [cell for cell in cells if cell.draw == 0 and cell != ALL]
+    recorded = [cell for cell in cells if cell != ALL]
     pairs: list[tuple[Cell, Cell]] = []
     for dimension in dict.fromkeys(cell.dimension for cell in recorded):
         pairs += combinations([cell for cell in recorded if cell.dimension == dimension][:MAX_PAIRED], 2)
@@ -253,6 +374,7 @@ def robustness(
     validation: FilePath | None = None,
     windows: Mapping[str, Sequence[float]] | None = None,
     zones: FilePath | AnyAreas | None = None,
+    viewpoints: Annotated[int, Range(1, 100_000)] = 64,
     resamples: Annotated[int, Range(199, 100_000)] = 199,
     seed: Annotated[int, SEEDS] = 0,
     rules: VisitRules = VisitRules(),
@@ -264,13 +386,15 @@ def robustness(
     """Test whether conclusions of AOI statistics survive other reasonable choices.
 
     Repeats the analysis of recordings with choices drawn at random: durations that define visits, sizes of areas,
-    tolerances, alignment, samples or fixations, weights of participants, and correction of the tracker's error. Reports
-    in how many analyses each conclusion holds, and which choice decides most.
+    tolerances, alignment, samples or fixations, weights of participants, and correction of the tracker's error. With
+    gaze fields, repeats that of their predictions: seeds, weight of the prior, and the choices that apply. Reports in
+    how many analyses each conclusion holds, and which choice decides most.
 
     Parameters
     ----------
     inputs : object, path or sequence of these
-        Rays or a dataset, and optionally an environment, in any order.
+        Rays or a dataset, an environment, and gaze fields of several seeds, in any order. With gaze fields, predictions
+        are tested, for the recorded positions.
     aois : Areas, path or mapping
         JSON file of areas of interest (AOIs), as for ``nerg stats``.
     choices : Choices
@@ -290,6 +414,8 @@ def robustness(
         repeatable.
     zones : Areas, path or mapping, optional
         JSON file of boxes on the floor; observers in different boxes are compared.
+    viewpoints : int
+        Approximate number of viewpoints of predictions, as for ``nerg stats``.
     resamples : int
         Number of bootstrap resamples of the participants for confidence intervals.
     seed : int
@@ -332,36 +458,56 @@ def robustness(
     if aois is None:
         raise NergError(f"no AOIs are given; add {parameter('aois', 'FILE')}")
     mode = str(activate_mitsuba().variant())
-    chosen, align = open_inputs(inputs, align)
-    if chosen.rays is None or chosen.gaze is not None:
-        raise NergError("choices are varied in the analysis of recordings: give rays and no gaze field")
+    items = list_inputs(inputs)
+    gaze_inputs = [item for item in items if find_role(item) == "gaze"]
+    chosen, align = open_inputs([item for item in items if not any(item is other for other in gaze_inputs[1:])], align)
+    if chosen.rays is None and not gaze_inputs:
+        raise NergError("there is nothing to analyse: give rays, or gaze fields")
     areas = Areas.open(aois, "aois")
     counting, counting_files = open_counting(Counting(rules, error=error), windows, zones, cohorts, validation)
-    files = [*existing_files(*chosen, *areas.files, align), *counting_files]
+    files = [*existing_files(*chosen, *gaze_inputs[1:], *areas.files, align), *counting_files]
     matrix = None if align is None else open_similarity(align, "rays to scene").matrix.tolist()
     if align is not None and not isinstance(align, (str, os.PathLike)):
         changed["align"] = matrix
     with open_reporter(progress) as reporter:
         reporter.progress(0.0, "reading")
-        base = Analyses(
-            open_placed_areas(chosen.environment, None, areas, align, sampling), open_rays(chosen.rays), counting
-        )
-        for note in base.placed.warnings:
+        placed = open_placed_areas(chosen.environment, chosen.gaze, areas, align, sampling)
+        if gaze_inputs:
+            gaze_fields = _open_gaze_fields([chosen.gaze, *gaze_inputs[1:]])
+            if counting.has_error:
+                reporter.message("predictions do not depend on the error of the tracker")
+            plain = replace(counting, error=TrackerError(), validation=None)
+            observed = None if chosen.rays is None else open_recordings(chosen.rays)
+            measured = AttentionAnalysis(
+                placed, observed, plain, None, MinParticipantsFilter(), resamples, seed, reporter
+            ).measure(viewpoints, None, ObserverGrid())
+            is_recorded, networks = observed is not None, list_networks(gaze_fields)
+            base: Analyses | Predictions = Predictions(
+                placed, networks, measured.viewpoints, is_recorded, measured.times
+            )
+        else:
+            gaze_fields, base = [], Analyses(placed, open_rays(chosen.rays), counting)
+        for note in placed.warnings:
             reporter.message(note)
         choices = _adapt_choices(choices, base, align, reporter)
-        drawn = [draw_choices(choices, np.random.default_rng((seed, k))) for k in range(analyses)]
-        table = [base.get_reference(), *drawn]
+        reference, num_fields = base.get_reference(), len(base.networks) - 1 if isinstance(base, Predictions) else 0
+        rngs = [np.random.default_rng((seed, k)) for k in range(analyses)]
+        drawn = [draw_choices(choices, reference.keys(), num_fields, rng) for rng in rngs]
+        table = [reference, *drawn]
+        reporter.progress(0.0, "analyses")
         if parallel.in_parts:
-            planned = PlannedAreas(None, None, areas, matrix, sampling, mode)
-            all_sums = _count_in_parts(base, planned, chosen.environment, table, PartRunner(parallel, None, reporter))
+            runner = PartRunner(parallel, None, reporter)
+            results = _compute_in_parts(base, chosen.environment, gaze_fields, areas, matrix, table, runner)
         else:
-            all_sums = _count_in_process(base, table, reporter)
-        single = np.isin(np.arange(len(base.placed.areas.names)), AoiContext(base.placed, counting).transition_areas)
-        evaluation, ranks, estimates = Evaluation(single, error.draws, resamples, seed), {}, []
-        for choice, sums in zip(table, all_sums):
-            ranks = ranks or evaluation.rank(sums, choice)
-            estimates.append(evaluation.evaluate(sums, choice, ranks))
-        result = conclusion_rows(estimates, drawn)
+            results = _compute_in_process(base, table, reporter)
+        names = placed.areas.names
+        single = np.isin(np.arange(len(names)), AoiContext(placed, counting).transition_areas)
+        evaluation, ranks, estimates = Evaluation(names, single, resamples, seed), {}, []
+        for choice, result in zip(table, results):
+            people = base.find_people(result, choice)
+            ranks = ranks or evaluation.rank(people, choice)
+            estimates.append(evaluation.evaluate(people, choice, ranks))
+        result = conclusion_rows(estimates, drawn, PREDICTED if gaze_inputs else MEASURED)
         provenance = make_provenance("nerg robustness", files, seed, changed | {"mode": mode})
         result = replace(result, provenance=provenance)
         for line in result.verdict.splitlines():
@@ -369,18 +515,59 @@ def robustness(
     return result
 
 
-def _adapt_choices(choices: Choices, base: Analyses, align: Any, reporter: Reporter) -> Choices:
-    """Return the choices that the inputs allow: those of alignment, tracker, boxes and fixations."""
+def _open_gaze_fields(inputs: Sequence[Any]) -> list[GazeField]:
+    """Open gaze fields. Raises `NergError` if the training of one had another environment than that of the first."""
+    gaze_fields = [GazeField.open(item) for item in inputs]
+    checksums = [(find_environment_record(f.provenance) or {}).get("sha256") for f in gaze_fields]
+    for gaze_field, checksum in zip(gaze_fields, checksums):
+        if checksum != checksums[0]:
+            raise NergError(
+                f"{gaze_field.label} was trained in another environment than {gaze_fields[0].label}; give fields that "
+                "differ in their seeds or settings"
+            )
+    return gaze_fields
+
+
+def _adapt_choices(choices: Choices, base: Analyses | Predictions, align: Any, reporter: Reporter) -> Choices:
+    """Return the choices that the inputs allow: those of alignment, boxes, and recordings or gaze fields."""
     turn, shift = _read_uncertainty(align)
     choices = replace(
         choices,
         rotation=turn if choices.rotation is None else choices.rotation,
         shift=shift if choices.shift is None else choices.shift,
     )
-    if not base.counting.has_error:
-        choices = replace(choices, tracker=("ignored",))
     if not base.placed.areas.boxes:
         choices = replace(choices, growth=(0.0, 0.0))
+    if isinstance(base, Predictions):
+        return _adapt_to_fields(choices, base, reporter)
+    return _adapt_to_rays(choices, base, reporter)
+
+
+def _adapt_to_fields(choices: Choices, base: Predictions, reporter: Reporter) -> Choices:
+    configs = [network.config for network in base.networks[1:]]
+    if len(configs) == 1:
+        reporter.message(
+            "seeds are not varied, because there is one gaze field: give several, or train an ensemble "
+            "(nerg train gaze --ensemble 5)"
+        )
+    if not base.is_recorded:
+        choices = replace(choices, weighting=("participants",))
+    if not all(config.prior for config in configs):
+        if choices.prior_weight is not None:
+            raise NergError("a gaze field has no prior, whose weight could be varied; leave out prior_weight")
+        return choices
+    if choices.prior_weight is None:
+        weights = [config.mix for config in configs]
+        ends = (
+            odds * weight / (1 - weight + odds * weight) for odds, weight in ((0.5, min(weights)), (2, max(weights)))
+        )
+        choices = replace(choices, prior_weight=tuple(ends))
+    return choices
+
+
+def _adapt_to_rays(choices: Choices, base: Analyses, reporter: Reporter) -> Choices:
+    if not base.counting.has_error:
+        choices = replace(choices, tracker=("ignored",))
     if "fixations" not in choices.samples:
         return choices
     rays, reason = base.rays, ""
@@ -411,29 +598,43 @@ def _read_uncertainty(align: Any) -> tuple[float, float]:
     return 2.0 * uncertainty.get("degrees", 0.0), 2.0 * uncertainty.get("cm", 0.0) / 100
 
 
-def _count_in_process(base: Analyses, table: Sequence[Row], reporter: Reporter) -> Iterator[VisitSums]:
-    """Yield the sums of each analysis, computed in this process."""
+def _compute_in_process(base: Analyses | Predictions, table: Sequence[Row], reporter: Reporter) -> Iterator[Any]:
+    """Yield the result of each analysis, computed in this process."""
     with Interruption() as stop:
         for k, choice in enumerate(table):
             stop.check()
-            yield base.count(choice)
+            yield base.compute(choice)
             reporter.progress((k + 1) / len(table), f"{k} of {len(table) - 1} analyses")
 
 
-def _count_in_parts(
-    base: Analyses, planned: PlannedAreas, environment: Any, table: Sequence[Row], runner: PartRunner
-) -> Iterator[VisitSums]:
-    """Yield the sums of each analysis, computed in parts."""
+def _compute_in_parts(
+    base: Analyses | Predictions,
+    environment: Any,
+    gaze_fields: Sequence[GazeField],
+    areas: Areas,
+    align: Any,
+    table: Sequence[Row],
+    runner: PartRunner,
+) -> Iterator[Any]:
+    """Yield the result of each analysis, computed in parts."""
     with runner.store.make_scratch_folder() as folder:
         file, _ = save_objects(environment, None, folder)
-        areas = planned.areas
-        if isinstance(areas, Areas) and areas.path is not None:
-            areas = FileGroup(areas.path, areas.files)
-        planned = replace(planned, environment=None if file is None else PlannedFiles.plan(file), areas=areas)
-        base.rays.save(folder / "rays.npz")
-        common = PlannedAnalyses(planned, folder / "rays.npz", base.counting)
+        files = tuple(
+            gaze_field.path or gaze_field.save(make_folder(folder / str(k)) / "gaze.safetensors")
+            for k, gaze_field in enumerate(gaze_fields)
+        )
+        job, sampling = f"nerg robustness {runner.store.folder.absolute()}", base.placed.sampling
+        planner = PartitionedStatistics(runner, job, file, files[0] if files else None, areas, align, sampling)
         parts = [Part(choice, f"analysis {k}" if k else "the reference") for k, choice in enumerate(table)]
-        job = f"nerg robustness {runner.store.folder.absolute()}"
-        plan = Plan(job, count_analysis, common, parts, ".npz", (*RENDER_LIBRARIES, "scipy"))
-        for output in runner.run(plan):
-            yield read_sums(output.path)[0]
+        if isinstance(base, Predictions):
+            poses = ObserverPoses(base.viewpoints.positions, base.viewpoints.facing)
+            planned = planner.plan_areas("margin", "aoi_samples", "directions")
+            common: Any = PlannedPredictions(planned, files, poses, base.is_recorded)
+            for output in runner.run(planner.make_plan(job, predict_analysis, common, parts)):
+                yield read_prediction(output.path)
+        else:
+            base.rays.save(folder / "rays.npz")
+            planned = planner.plan_areas("tolerance", "margin", "aoi_samples", "cell_size")
+            common = PlannedAnalyses(planned, folder / "rays.npz", base.counting)
+            for output in runner.run(planner.make_plan(job, count_analysis, common, parts)):
+                yield read_sums(output.path)[0]

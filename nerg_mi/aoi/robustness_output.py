@@ -79,8 +79,11 @@ def explain_variance(values: Sequence[Any], estimates: np.ndarray) -> float:
     return float(np.clip((between - (len(groups) - 1) * within) / total, 0.0, 1.0)) if p < MAX_P else 0.0
 
 
-def conclusion_rows(estimates: Sequence[Mapping[Conclusion, Triple]], drawn: Sequence[Row]) -> RobustnessResult:
-    """Return the tables of the ``estimates`` of the reference, which is the first, and of the analyses ``drawn``."""
+def conclusion_rows(
+    estimates: Sequence[Mapping[Conclusion, Triple]], drawn: Sequence[Row], source: str
+) -> RobustnessResult:
+    """Return the tables of the ``estimates`` of the reference, which is the first, and of the analyses ``drawn``;
+    ``source`` is that of the values, as in statistics."""
     rows, long = list[Row](), list[Row]()
     for conclusion, (reference, ref_low, ref_high) in estimates[0].items():
         is_rank = conclusion.kind == "rank"
@@ -95,6 +98,7 @@ def conclusion_rows(estimates: Sequence[Mapping[Conclusion, Triple]], drawn: Seq
         row: Row = {
             "conclusion": conclusion.describe(sign < 0),
             "measure": conclusion.measure,
+            "source": source,
             "reference": sign * reference,
             "low": None if np.isnan(ref_low) else min(sign * ref_low, sign * ref_high),
             "high": None if np.isnan(ref_high) else max(sign * ref_low, sign * ref_high),

@@ -124,6 +124,11 @@ class Choices(ValidatedDataclass):
     """Shortest fixation in seconds."""
     tracker: tuple[str, ...] = ("corrected", "ignored")
     """Error of the eye tracker, if one is given."""
+    glance_duration: tuple[float, float] = range_field((0.2, 0.4), Range(0.001, 10**6))
+    """Duration of a glance in seconds, for predicted hit ratios."""
+    prior_weight: tuple[float, float] | None = range_field(None, Range(0, 1))
+    """Weight of the position-independent prior of gaze fields, of which five values are drawn. None: from half to twice
+    the odds of the fields' own weights."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -132,5 +137,5 @@ class Choices(ValidatedDataclass):
             if isinstance(field.default, tuple) and isinstance(field.default[0], str):
                 if not value or not set(value) <= set(field.default):
                     raise NergError(f"{field.name} must be some of {', '.join(field.default)}, got {value!r}")
-            elif isinstance(field.default, tuple) and not (len(value) == 2 and value[0] <= value[1]):
+            elif isinstance(value, tuple) and not (len(value) == 2 and value[0] <= value[1]):
                 raise NergError(f"{field.name} must be a lower and an upper end, got {value!r}")

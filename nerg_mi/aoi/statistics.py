@@ -217,7 +217,7 @@ def statistics(
     with open_reporter(progress) as reporter:
         reporter.progress(0.0, "reading")
         with _open_parts(chosen, areas, align, sampling, parallel, reporter) as parts:
-            work = _Analysis(
+            work = AttentionAnalysis(
                 open_placed_areas(chosen.environment, chosen.gaze, areas, align, sampling),
                 None if chosen.rays is None else open_recordings(chosen.rays),
                 counting,
@@ -305,13 +305,19 @@ def _check_observers(observers: ArrayLike) -> np.ndarray:
 # ---- Inputs ----
 
 
+def list_inputs(inputs: Any) -> list[Any]:
+    """Return one or several inputs as a list. Raises `NergError` for files that are none."""
+    items = list(inputs) if isinstance(inputs, (list, tuple)) else [inputs]
+    for item in items:
+        if isinstance(item, (str, os.PathLike)) and Path(item).suffix.lower() in (".json", ".csv"):
+            raise NergError(f'"{item}" is not rays, a scene or a field; AOIs are given with {parameter("aois")}')
+    return items
+
+
 def open_inputs(inputs: Any, align: Any) -> tuple[Inputs, Any]:
     """Return the inputs by their roles, as files where they have one, and ``align`` or that of an environment in
     memory. A gaze field without a file brings the environment of its training."""
-    for item in inputs if isinstance(inputs, (list, tuple)) else [inputs]:
-        if isinstance(item, (str, os.PathLike)) and Path(item).suffix.lower() in (".json", ".csv"):
-            raise NergError(f'"{item}" is not rays, a scene or a field; AOIs are given with {parameter("aois")}')
-    chosen = sort_inputs(inputs)
+    chosen = sort_inputs(list_inputs(inputs))
     if all(value is None for value in chosen):
         raise NergError("there is no input; give rays, a scene, or a gaze field")
     environment = chosen.environment
@@ -344,7 +350,7 @@ def _open_parts(
 
 
 @dataclass(frozen=True, eq=False)
-class _Attention:
+class MeasuredAttention:
     """Attention of participants by cell and source: ``sums`` of recordings, all sums with those of
     ``disturbed`` samples, and what a gaze field predicts from ``viewpoints``, with the recorded ``times`` of
     participants."""
@@ -358,7 +364,7 @@ class _Attention:
 
 
 @dataclass(frozen=True, eq=False)
-class _Analysis:
+class AttentionAnalysis:
     """Computes the statistics; ``parts`` is None if all is computed in this process."""
 
     placed: PlacedAreas
@@ -385,7 +391,7 @@ class _Analysis:
         if self.rays is None and self.placed.sampler is None:
             raise NergError("there are no observers: give rays or a gaze field")
 
-    def measure(self, num_viewpoints: int, observers: np.ndarray | None, grid: ObserverGrid) -> _Attention:
+    def measure(self, num_viewpoints: int, observers: np.ndarray | None, grid: ObserverGrid) -> MeasuredAttention:
         """Count visits, and predict the attention from recorded positions or those of observers."""
         people: dict[Cell, dict[str, Participants]] = {ALL: {}}
         times: dict[Cell, dict[str, float]] = {}
@@ -412,7 +418,7 @@ class _Analysis:
                     people[cell][PREDICTED] = predicted_people
         _report_small_groups(people, self.reporter)
         _report_values_without_comparison(people, self.reporter)
-        return _Attention(sums, disturbed, viewpoints, predicted, people, times)
+        return MeasuredAttention(sums, disturbed, viewpoints, predicted, people, times)
 
     def _count(self, rays: Rays | RayDataset, num_viewpoints: int) -> tuple[VisitSums, Viewpoints]:
         context, count = self._make_context(rays), len(rays)
@@ -492,7 +498,7 @@ class _Analysis:
         return replace(predicted, note=note)
 
     def make_tables(
-        self, attention: _Attention, power: float | None, show_names: bool, salt: FilePath | None
+        self, attention: MeasuredAttention, power: float | None, show_names: bool, salt: FilePath | None
     ) -> StatisticsResult:
         """Return all tables except that of changes."""
         sums, people, suppression, seed = attention.sums, attention.people, self.suppression, self.seed

@@ -120,6 +120,11 @@ class ObserverPoses:
     positions: np.ndarray
     facing: np.ndarray
 
+    def to_viewpoints(self) -> Viewpoints:
+        """Return viewpoints of nobody."""
+        count = len(self.positions)
+        return Viewpoints(self.positions, self.facing, ("",) * count, (frozenset(),) * count)
+
 
 VIEWPOINT_ARRAYS = ("share", "distance", "visible", "support")
 """Arrays of a prediction with one row per viewpoint. ``members`` has an additional first axis."""
@@ -128,10 +133,12 @@ VIEWPOINT_ARRAYS = ("share", "distance", "visible", "support")
 def predict_part(common: PlannedPrediction, poses: ObserverPoses, output: Path) -> None:
     """Write the predicted attention (.npz) of some observers."""
     placed: PlacedAreas = prepare_once(common, common.areas.open)
-    count = len(poses.positions)
-    viewpoints = Viewpoints(poses.positions, poses.facing, ("",) * count, (frozenset(),) * count)
-    predicted = predict_attention(placed, viewpoints, common.fov)
-    with replace_atomically(output) as temporary, temporary.open("wb") as out:
+    write_prediction(output, predict_attention(placed, poses.to_viewpoints(), common.fov))
+
+
+def write_prediction(path: Path, predicted: PredictedAttention) -> None:
+    """Write a prediction (.npz), as `read_prediction` reads it."""
+    with replace_atomically(path) as temporary, temporary.open("wb") as out:
         np.savez(out, **{name: getattr(predicted, name) for name in (*VIEWPOINT_ARRAYS, "members")})
 
 
@@ -210,7 +217,7 @@ class PartitionedStatistics:
         """Yield the sums of each block of samples, in the order of `iter_blocks`. ``on_block`` is called with each
         block before, in the same order."""
         common = PlannedCount(
-            self._plan_areas("tolerance", "margin", "aoi_samples", "cell_size"),
+            self.plan_areas("tolerance", "margin", "aoi_samples", "cell_size"),
             context.counting,
             context.use_hit_points,
             context.cohort_names,
@@ -243,13 +250,13 @@ class PartitionedStatistics:
                     parts.append(Part(path, f"samples {first:,} to {first + len(block) - 1:,}"))
                     first += len(block)
             end = _PROGRESS_PREDICTED if on_block is None else _PROGRESS_COUNTED
-            for output in self.parts.run(self._plan(self.job_name, count_part, common, parts), 0.0, end):
+            for output in self.parts.run(self.make_plan(self.job_name, count_part, common, parts), 0.0, end):
                 yield from read_sums(output.path)
 
     def predict(self, viewpoints: Viewpoints, fov: float, changes: Any = None) -> PredictedAttention:
         """Predict the attention of ``viewpoints`` with a field of view of ``fov`` degrees, after ``changes``, those of
         a file or a dict."""
-        areas, job_name = self._plan_areas("margin", "aoi_samples", "directions"), f"{self.job_name} (prediction)"
+        areas, job_name = self.plan_areas("margin", "aoi_samples", "directions"), f"{self.job_name} (prediction)"
         start, end = _PROGRESS_COUNTED, _PROGRESS_PREDICTED
         if changes is not None:
             planned = opened = open_changes(changes)
@@ -263,15 +270,16 @@ class PartitionedStatistics:
                 viewpoints.positions[a : a + VIEWPOINTS_PER_PART], viewpoints.facing[a : a + VIEWPOINTS_PER_PART]
             )
             parts.append(Part(poses, f"viewpoints {a + 1} to {a + len(poses.positions)}"))
-        plan = self._plan(job_name, predict_part, PlannedPrediction(areas, fov), parts)
+        plan = self.make_plan(job_name, predict_part, PlannedPrediction(areas, fov), parts)
         predictions = [read_prediction(output.path) for output in self.parts.run(plan, start, end)]
         arrays = {name: np.concatenate([getattr(f, name) for f in predictions]) for name in VIEWPOINT_ARRAYS}
         return PredictedAttention(**arrays, members=np.concatenate([f.members for f in predictions], axis=1), note="")
 
-    def _plan(self, job_name: str, work: Callable, common: Any, parts: list[Part]) -> Plan:
+    def make_plan(self, job_name: str, work: Callable, common: Any, parts: list[Part]) -> Plan:
+        """Plan ``parts`` that ``work`` computes."""
         return Plan(job_name, work, common, parts, ".npz", (*RENDER_LIBRARIES, "scipy"))
 
-    def _plan_areas(self, *names: str) -> PlannedAreas:
+    def plan_areas(self, *names: str) -> PlannedAreas:
         """Plan the areas with the values of the sampling that affect the result, by ``names``."""
         environment, gaze = self.environment, None
         if self.gaze is not None:

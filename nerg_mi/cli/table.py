@@ -485,7 +485,7 @@ TABLE = (
         fastest=True,
         spellings={"windows": ("--window",)},
         groups={INPUT: ("aois", "align", "cohorts", "validation", "windows", "zones"), ANALYSIS: ("analyses", "seed")},
-        without=("choices", "resamples", "min_visit", "tolerance"),
+        without=("choices", "viewpoints", "resamples", "min_visit", "tolerance"),
     ),
     Row(
         "report",

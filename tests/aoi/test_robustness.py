@@ -4,18 +4,30 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
+import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
 import nerg_mi as nerg
+from nerg_mi.aoi.areas import Areas
+from nerg_mi.aoi.placed import open_placed_areas
+from nerg_mi.aoi.predicted import viewpoints_at
+from nerg_mi.aoi.robustness import Predictions, list_networks
 from nerg_mi.aoi.robustness_output import explain_variance
-from nerg_mi.aoi.settings import Choices, TrackerError
-from nerg_mi.maths.geometry import Similarity
+from nerg_mi.aoi.settings import AoiSampling, Choices, TrackerError
+from nerg_mi.fields.gaze_base import make_prior_table, table_directions
+from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
+from nerg_mi.formats.fields import save_gaze
+from nerg_mi.maths.geometry import Box, Similarity
+from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.tasks.settings import Parallel
 from nerg_mi.tracking.rays import Rays
 from tests.aoi.place import people, write_place
 from tests.conftest import ROOT
+from tests.plugins.fields import GRID
+from tests.recorder import Recorder
 
 CENTERS = np.array([[-8.0, 0.0], [0.0, 0.0], [8.0, 0.0], [0.0, 12.0]])  # degrees; the last one is no area
 DISTANCE = 10.0
@@ -48,6 +60,31 @@ def record(shares: np.ndarray, seed: int, count: int = 16, fixations: int = 40) 
     )
 
 
+def write_gaze(path: Path, seed: int, geometry: str = "surface", sha256: str | None = None) -> Path:
+    """A gaze field of noise, mixed with a prior that looks along the x axis."""
+    rows = 8
+    density = np.exp(20 * (table_directions(rows)[:, 0] - 1))
+    config = LogGazeConfig(
+        GRID, width=16, layers=1, sh_degree=2, mix=0.3, prior=rows, prior_factor=False, geometry=geometry
+    )
+    prior = make_prior_table(density, rows, ns, fibonacci_directions(4096))
+    field = LogGazeField.random(config, Box((0, 0, 0), (6, 4, 3)), ns, seed, prior)
+    table = 2 * np.random.default_rng(seed).normal(size=len(field.grid.table)).astype(np.float32)
+    field.set_parameters({"grid.table": ns.Float(table)})
+    recorded = {"geometry_file": {"file": "room", "sha256": sha256}} if sha256 else {}
+    save_gaze(field, path, {"geometry": "none"} if geometry == "none" else recorded)
+    return path
+
+
+FIXED = Choices(margin=(0.03, 0.03), growth=(0, 0), weighting=("participants",), glance_duration=(0.3, 0.3))
+COARSE = {"viewpoints": 6, "sampling": AoiSampling(directions=512, aoi_samples=4)}
+
+
+def estimates_of(result, conclusion, measure="share"):
+    rows = [e for e in result.estimates if (e["conclusion"], e["measure"]) == (conclusion, measure)]
+    return np.array([row["estimate"] for row in rows])
+
+
 def verdicts(result, measure="share"):
     return {row["conclusion"]: row["verdict"] for row in result.conclusions if row["measure"] == measure}
 
@@ -68,6 +105,101 @@ def test02_equal_areas_hardly_ever_differ():
         counts += [verdict for name, verdict in verdicts(result).items() if ">" in name]
     assert len(counts) > 20
     assert counts.count("survives") <= 4 and counts.count("undecided") >= 12
+
+
+def test12_the_reference_predicts_as_statistics_do(tmp_path, rgb):
+    write_place(tmp_path, gaze=False)
+    gaze = [write_gaze(tmp_path / f"{seed}.safetensors", seed) for seed in range(2)]
+    inputs, areas = [tmp_path / "scene.xml", people(each=40)], tmp_path / "areas.json"
+    result = nerg.robustness([*inputs, *gaze], areas, analyses=10, choices=replace(FIXED, margin=(0.01, 0.1)), **COARSE)
+    stats = nerg.statistics([*inputs, gaze[0]], areas, resamples=199, **COARSE).aois
+    values = {(r["value"], r["aoi"]): r for r in stats if r["source"] == "predicted"}
+    compared = 0
+    for row in result.conclusions:
+        assert row["source"] == "predicted" and row["measure"] in ("share", "hit_ratio")
+        names = row["conclusion"].split(" > ")
+        if ": " not in names[0] and len(names) == 2:
+            one, other = (values["", name][row["measure"]] for name in names)
+            assert row["reference"] == pytest.approx(one - other, rel=1e-6)
+            compared += 1
+    assert compared == 2 and any("cohort" in row["conclusion"] for row in result.conclusions)
+    assert {row["field"] for row in result.analyses} == {1, 2}
+    weights = {round(row["prior_weight"], 3) for row in result.analyses}
+    assert len(weights) > 1 and min(weights) >= 0.176 and max(weights) <= 0.462  # half and twice the odds 3 : 7
+
+
+def test13_fields_and_priors_decide(tmp_path, rgb):
+    write_place(tmp_path, gaze=False)
+    gaze = [write_gaze(tmp_path / f"{seed}.safetensors", seed) for seed in range(2)]
+    inputs, areas = [tmp_path / "scene.xml", people(each=40)], tmp_path / "areas.json"
+
+    def test(gaze_inputs, weights):
+        choices = replace(FIXED, prior_weight=weights)
+        result = nerg.robustness([*inputs, *gaze_inputs], areas, analyses=20, choices=choices, **COARSE)
+        (name,) = (n for n in verdicts(result) if "cohort" not in n and " > " in n)
+        row = next(r for r in result.conclusions if (r["conclusion"], r["measure"]) == (name, "share"))
+        return result, row, estimates_of(result, name)
+
+    result, row, estimates = test(gaze, (0.3, 0.3))
+    of_field = [estimates[[a["field"] == k for a in result.analyses]] for k in (1, 2)]
+    assert all(np.ptp(values) < 1e-9 for values in of_field) and abs(of_field[0][0] - of_field[1][0]) > 1e-4
+    assert row["decides"] == "field" and row["explained"] > 0.99
+    assert of_field[0][0] == pytest.approx(row["reference"], rel=1e-6)
+    result, row, estimates = test(gaze[:1], (0.0, 1.0))
+    weights = np.array([a["prior_weight"] for a in result.analyses])
+    assert row["decides"] == "prior_weight" and len(set(weights)) == 5
+    # A mixture is linear in its weight.
+    line = np.polynomial.Polynomial.fit(weights, estimates, 1)
+    assert np.allclose(line(weights), estimates, atol=0.02 * np.ptp(estimates))
+
+
+def test14_a_field_moves_with_its_tracking(tmp_path, rgb):
+    """Where surfaces are unknown, a shift of the tracking is the opposite shift of all areas."""
+    gaze = nerg.GazeField.load(write_gaze(tmp_path / "gaze.safetensors", 3, geometry="none"))
+    eyes = np.array([[1.0, 2, 1.6], [2.0, 1, 1.5]])
+    shift = np.array([0.2, -0.1, 0.05])
+
+    def predict(offset, choice):
+        corners = (np.array([[4.0, 1.5, 1.0], [4.2, 2.5, 2.0]]) - offset).tolist()
+        placed = open_placed_areas(None, gaze, Areas.open({"sign": corners}))
+        base = Predictions(placed, list_networks([gaze]), viewpoints_at(eyes), True)
+        return base.compute(base.get_reference() | choice).share
+
+    moved, at_rest = predict(np.zeros(3), dict(zip(("shift_x", "shift_y", "shift_z"), shift))), predict(shift, {})
+    assert np.allclose(moved, at_rest, rtol=0.02)
+    assert not np.allclose(predict(np.zeros(3), {}), moved, rtol=0.05)
+
+
+class Stopper(Recorder):
+    """Stops after four analyses."""
+
+    def progress(self, fraction: float, text: str = "") -> None:
+        super().progress(fraction, text)
+        if text.startswith("4 of 11"):
+            raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("is_predicted", [False, True])
+def test15_analyses_resume(tmp_path, rgb, monkeypatch, is_predicted):
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    write_place(tmp_path, gaze=False)
+    inputs = [tmp_path / "scene.xml", people(each=20)]
+    # The second field is in memory.
+    gaze = [write_gaze(tmp_path / f"{seed}.safetensors", seed) for seed in range(2)] if is_predicted else []
+    gaze[1:] = [replace(nerg.GazeField.load(file), path=None) for file in gaze[1:]]
+    settings = {**COARSE, "analyses": 10, "choices": replace(FIXED, prior_weight=(0.3, 0.3))}
+    parallel = Parallel(store=tmp_path / "store", scheduler="local:1")
+
+    def test(**more):
+        return nerg.robustness([*inputs, *gaze], tmp_path / "areas.json", **settings, **more)
+
+    with pytest.raises(KeyboardInterrupt):
+        test(parallel=parallel, progress=Stopper())
+    recorder = Recorder()
+    result = test(parallel=parallel, progress=recorder)
+    done = [int(text.split()[0]) for _, text in recorder.steps if " of 11 " in text]
+    assert done[0] >= 4 and done[-1] == 11
+    assert result.estimates == test().estimates
 
 
 def test09_the_reference_has_the_differences_of_statistics():
@@ -179,13 +311,18 @@ def test07_invalid_ranges(choices):
 def test08_invalid_inputs(tmp_path, rgb):
     rays = record(np.array([0.4, 0.3, 0.1, 0.2]), 2, count=3, fixations=5)
     write_place(tmp_path)
-    for inputs in (tmp_path / "scene.xml", [rays, tmp_path / "gaze.safetensors"]):
-        with pytest.raises(nerg.NergError, match="rays"):
-            nerg.robustness(inputs, AREAS)
+    with pytest.raises(nerg.NergError, match="rays"):
+        nerg.robustness(tmp_path / "scene.xml", AREAS)
     with pytest.raises(nerg.NergError, match="AOIs"):
         nerg.robustness(rays)
     with pytest.raises(nerg.NergError, match="fixation"):
         nerg.robustness(rays.with_tracking("head"), AREAS, choices=Choices(samples=("fixations",)))
+    weighted = Choices(prior_weight=(0.1, 0.2))
+    with pytest.raises(nerg.NergError, match="prior"):
+        nerg.robustness([rays, tmp_path / "gaze.safetensors", tmp_path / "scene.xml"], AREAS, choices=weighted)
+    gaze = write_gaze(tmp_path / "0.safetensors", 0), write_gaze(tmp_path / "1.safetensors", 1, sha256="0" * 64)
+    with pytest.raises(nerg.NergError, match="environment"):
+        nerg.robustness([rays, tmp_path / "scene.xml", *gaze], AREAS)
 
 
 def test10_files_and_verdict(tmp_path):
