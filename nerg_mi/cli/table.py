@@ -523,7 +523,7 @@ TABLE = (
         fastest=True,
         spellings={"defaults": ("-D", "--define"), "sensor": ("-s", "--sensor")},
         groups={
-            INPUT: ("frames", "defaults"),
+            INPUT: ("frames", "defaults", "objects", "time", "person", "align"),
             VIEW: ("sensor", "overlay", "vmax", "smoothing"),
             OUTPUT: ("fps",),
             PERFORMANCE: ("spp", "memory"),

@@ -11,15 +11,17 @@ from typing import Any, TypeAlias, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nerg_mi.errors import MissingFile, NergError, translate_mitsuba_errors
+from nerg_mi.errors import MissingFile, NergError, sanitize, translate_mitsuba_errors
 from nerg_mi.fields.gaze_base import GazeNetwork
 from nerg_mi.fields.splats import Splats
 from nerg_mi.files.atomic import check_writable, write_text
 from nerg_mi.files.html import key_value_table
 from nerg_mi.files.values import FilePath, to_numbers
+from nerg_mi.formats.alignments import AnySimilarity, open_similarity
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.types import Axes, Figure, MitsubaScene, Sensor, Unpack
-from nerg_mi.progress import Progress
+from nerg_mi.progress import Progress, WarningReporter
+from nerg_mi.tracking.objects import ObjectPoses
 from nerg_mi.transport.geometry import SceneGeometry, check_shape
 from nerg_mi.transport.observer import ObserverSettings
 
@@ -38,6 +40,7 @@ from .contents import (
 from .hits import NO_DATA_GREY, read_hit_volume, shade_hits
 from .integrator_settings import IntegratorSettings, check_settings
 from .kinds import ROLES, detect_kind
+from .moments import Moment, ShapeMover
 from .nested_scene import SceneDocument
 from .scene_loading import activate_mitsuba, check_sensor, load_scene
 from .scene_writer import compute_clip_distances
@@ -113,6 +116,7 @@ class Scene:
         self.path: Path | None = None
         self._content: dict[str, Any] | None = None
         self.source: tuple[Path, dict[str, str]] | None = None
+        self._mover: ShapeMover | None = None
 
     @classmethod
     def load(cls, path: FilePath, **values: object) -> Scene:
@@ -337,6 +341,40 @@ class Scene:
 
         for trained in get_trained_fields(self.integrator):
             set_constant_weights(trained, constant)
+
+    def move_objects(
+        self,
+        objects: FilePath | ObjectPoses,
+        time: float,
+        *,
+        person: str = "",
+        align: FilePath | AnySimilarity | None = None,
+    ) -> None:
+        """Move shapes to where they were at a time, until the next call; those that were absent are shrunk to a point.
+
+        A warning names objects whose pose is unknown. `save` writes the scene as it was before.
+
+        Parameters
+        ----------
+        objects : ObjectPoses or path
+            Poses of shapes (`nerg_mi.tracking.objects`).
+        time : float
+            Time in seconds on their clock.
+        person : str
+            The participant, if participants have poses of their own.
+        align : path or similarity, optional
+            Similarity from the frame of the poses to that of the scene. Default: the identity.
+
+        Raises
+        ------
+        NergError
+            No object is a shape of the scene, or a shape cannot be moved.
+        """
+        to_scene = Similarity() if align is None else open_similarity(align, "objects to scene")
+        moment = Moment(ObjectPoses.open(objects), time, person, to_scene)
+        self._mover = self._mover or ShapeMover(self.mitsuba)
+        for name in self._mover.move(moment, time):
+            WarningReporter().warn(f'the pose of the object "{sanitize(name, 40)}" is unknown then; it is left out')
 
     @property
     def default_quantities(self) -> tuple[str, ...]:

@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter, sanitize
 
 from .bands import is_nerg
+from .moments import Moment, ShapeMover
 from .scene_loading import check_scene, check_scene_file, list_scene_files, load_scene
 
 _MOVABLE = frozenset(
@@ -35,27 +36,51 @@ class SceneSequence:
         Values of all scenes.
     loaded
         A Mitsuba scene in memory, which is the only scene. None: the file is loaded.
+    moment
+        Where objects were; ``time`` among the values of a scene replaces its time. ``unknown_objects`` are those whose
+        pose is unknown in the last scene.
     """
 
-    def __init__(self, path: Path, values: Mapping[str, str] | None = None, loaded: Any = None):
+    def __init__(
+        self, path: Path, values: Mapping[str, str] | None = None, loaded: Any = None, moment: Moment | None = None
+    ):
         self.path, self.values = path, dict(values or {})
         self.has_file = loaded is None
         self._scene: Any = loaded
         self._nodes: Any = None
+        self.moment, self.unknown_objects = moment, list[str]()
+        self._mover: ShapeMover | None = None
 
     def list_files(self, frame: Mapping[str, str]) -> list[Path]:
         """Return the scene file and the files that it names with ``frame``; none for a scene in memory."""
-        return list_scene_files(self.path, {**self.values, **frame}) if self.has_file else []
+        files = list_scene_files(self.path, self._split_time(frame)[0]) if self.has_file else []
+        return files if self.moment is None else [*files, *self.moment.files]
 
     def load(self, frame: Mapping[str, str]) -> Any:
         """Return the Mitsuba scene with the values of ``frame``, too; errors as for `load_scene`."""
-        values = {**self.values, **frame}
+        values, time = self._split_time(frame)
         if self.has_file and (self._scene is None or not self._move_sensors(values)):
             # Before the next scene is read, the memory of the last one is free.
-            self._scene = self._nodes = None
-            self._scene = load_scene(self.path, values)
+            self._scene = self._nodes = self._mover = None
+            # Merged meshes would lose their names.
+            self._scene = load_scene(self.path, values, merge=self.moment is None)
             self._nodes = self._parse(values).nodes
+        if self.moment is not None:
+            self._mover = self._mover or ShapeMover(self._scene)
+            self.unknown_objects = self._mover.move(self.moment, time)
         return self._scene
+
+    def _split_time(self, frame: Mapping[str, str]) -> tuple[dict[str, str], float]:
+        """Return the values of `<default>`s, and the time of the moment, 0 without one. Raises `NergError`."""
+        values = {**self.values, **frame}
+        if self.moment is None:
+            return values, 0.0
+        time = values.pop("time", self.moment.time)
+        try:
+            return values, float(time)  # pyright: ignore[reportArgumentType]
+        except (TypeError, ValueError) as error:
+            got = "none" if time is None else f'"{sanitize(time, 40)}"'
+            raise NergError(f"the time of objects must be seconds, got {got}; set {parameter('time')}") from error
 
     def _move_sensors(self, values: Mapping[str, str]) -> bool:
         """Give the loaded scene its sensors with ``values``; return False if other objects change, too."""

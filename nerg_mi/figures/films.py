@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 import tempfile
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from time import perf_counter
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
+from nerg_mi.environment.moments import Moment
 from nerg_mi.environment.planned import PlannedFiles
 from nerg_mi.environment.rendering_files import IMAGE_FORMATS, frame_path, read_frames
 from nerg_mi.environment.scene import Scene
@@ -21,11 +22,14 @@ from nerg_mi.files.atomic import check_writable
 from nerg_mi.files.html import Summary
 from nerg_mi.files.values import FilePath, to_path
 from nerg_mi.files.video import check_video_output, open_video_writer
+from nerg_mi.formats.alignments import AnySimilarity, open_similarity
 from nerg_mi.interruption import Interruption
+from nerg_mi.maths.geometry import Similarity
 from nerg_mi.progress import SILENT, Progress, Reporter, open_reporter
-from nerg_mi.ranges import POSITIVE_VALUES, RATES, SEEDS, SPP, Range, check_ranges
+from nerg_mi.ranges import POSITIVE_VALUES, RATES, SEEDS, SPP, TIMES, Range, check_ranges
 from nerg_mi.tasks.settings import Parallel
 from nerg_mi.tasks.task import Part, Plan
+from nerg_mi.tracking.objects import ObjectPoses
 
 from .frames import (
     DrawnPicture,
@@ -100,6 +104,10 @@ def render_film(
     sensor: Annotated[int, Range(0, 65535)] = 0,
     spp: Annotated[int, Range(0, SPP.high)] = 0,
     seed: Annotated[int, SEEDS] = 0,
+    objects: FilePath | ObjectPoses | None = None,
+    time: Annotated[float, TIMES] | None = None,
+    person: str | None = None,
+    align: FilePath | AnySimilarity | None = None,
     overlay: str | None = None,
     vmax: Annotated[float, POSITIVE_VALUES] | None = None,
     smoothing: Annotated[float, Range(0, 30)] = SMOOTHING,
@@ -132,6 +140,16 @@ def render_film(
         Samples per pixel; 0: as in the scene file.
     seed : int
         Seed of the random numbers for sampling.
+    objects : ObjectPoses or path, optional
+        Table with columns time,object,x,y,z,qw,qx,qy,qz (`nerg_mi.tracking.objects`): poses of shapes that move. They
+        are rendered where they were at the time of the picture, and those that are absent are left out.
+    time : float, optional
+        Time in seconds on the clock of the objects. A column time of the frames gives each picture its own.
+    person : str, optional
+        Participant whose objects are rendered, if participants have poses of their own.
+    align : path or similarity, optional
+        JSON file with the 4x4 similarity from the frame of the objects to that of the scene, as nerg align writes it.
+        Default: the identity.
     overlay : str, optional
         Name of the AOV that is drawn over the colour, with a colour scale: gaze, kde, depth or any other. The output
         must be .png, .svg or .mp4. Default: colour only.
@@ -182,11 +200,14 @@ def render_film(
     'gaze.png'
     """
     output = to_path(output)
-    start, is_video = time.perf_counter(), output.suffix.lower() == VIDEO
+    start, is_video = perf_counter(), output.suffix.lower() == VIDEO
     appearance = {name: getattr(style, name) for name in ("cmap", "log_decades", "hatching")}
     look = {"vmax": vmax, "smoothing": smoothing, **appearance}
     _check_output(output, overlay, look, frames is not None, fps)
-    source, listed = _open_scene(scene, defaults or {}), _list_frames(frames)
+    moment = _open_moment(objects, time, person, align)
+    source, listed = _open_scene(scene, defaults or {}, moment), _list_frames(frames)
+    if moment is not None and parallel.in_parts:
+        raise NergError(f"pictures with {parameter('objects')} are rendered at once; leave out {parameter('store')}")
     if not source.has_file and (defaults or frames is not None or parallel.in_parts):
         raise NergError(
             "a scene in memory has one picture, which is rendered at once; save the scene, and pass its file"
@@ -207,6 +228,7 @@ def render_film(
         mode = mi.variant() or activate_variant()
         settings = FrameSettings(mode, sensor, spp, seed, memory, overlay, smoothing)
         recorded = {} if overlay is None else {"overlay": overlay, **look}
+        recorded |= {k: v for k, v in (("time", time), ("person", person)) if v is not None}
         work = _FilmTask(source, listed, settings, drawing, FilmProvenance(source, settings, recorded))
         video = work.provenance.make_video(listed[0], existing_files(frames), fps) if is_video else None
         with _open_writer(files, video, fps) as write:
@@ -214,7 +236,7 @@ def render_film(
                 shown = _render_in_parts(work, output, files, parallel, reporter, write)
             else:
                 shown = _render_at_once(work, reporter, write)
-        film = Film(tuple(files), mode, time.perf_counter() - start, *shown)
+        film = Film(tuple(files), mode, perf_counter() - start, *shown)
         reporter.message(_summarize(film, f"{len(listed)} frames at {fps:g} per second" if is_video else "", memory))
     return film
 
@@ -312,17 +334,30 @@ def _check_output(output: Path, overlay: str | None, look: Mapping[str, Any], is
         )
 
 
-def _open_scene(scene: Any, defaults: Frame) -> SceneSequence:
+def _open_moment(objects: Any, time: float | None, person: str | None, align: Any) -> Moment | None:
+    """Return where objects are in the pictures; None without any. Raises `NergError`."""
+    if objects is None:
+        options = {"time": time, "person": person, "align": align}
+        if name := next((name for name, value in options.items() if value is not None), None):
+            raise NergError(f"{parameter(name)} applies to objects that move; add {parameter('objects', 'FILE')}")
+        return None
+    to_scene = Similarity() if align is None else open_similarity(align, "objects to scene")
+    return Moment(ObjectPoses.open(objects), time, person or "", to_scene, tuple(existing_files(objects, align)))
+
+
+def _open_scene(scene: Any, defaults: Frame, moment: Moment | None) -> SceneSequence:
     """Return a scene with values of its `<default>`s. Raises `NergError` if there is no such file."""
     if isinstance(scene, (str, os.PathLike)):
         if not os.path.exists(scene):
             raise NergError(f'there is no scene file "{scene}"')
-        return SceneSequence(Path(scene), defaults)
+        return SceneSequence(Path(scene), defaults, moment=moment)
     opened = Scene.coerce(scene)
     if opened.source is None:
+        if moment is not None:
+            raise NergError("shapes of a scene in memory are moved by its method move_objects; call it before")
         return SceneSequence(Path("scene in memory"), defaults, opened.mitsuba)
     path, values = opened.source
-    return SceneSequence(path, {**values, **defaults})
+    return SceneSequence(path, {**values, **defaults}, moment=moment)
 
 
 def _list_frames(frames: Any) -> Sequence[Frame]:

@@ -17,7 +17,7 @@ from nerg_mi.environment.bands import ConstantWeightsTrial, SamplePace
 from nerg_mi.environment.rendering_files import DisplayRows, open_image_rows
 from nerg_mi.environment.scene_sequence import SceneSequence
 from nerg_mi.environment.sensors import describe_observer
-from nerg_mi.errors import NergError, parameter, translate_mitsuba_errors
+from nerg_mi.errors import NergError, parameter, sanitize, translate_mitsuba_errors
 from nerg_mi.files.atomic import replace_atomically
 from nerg_mi.files.safe_read import read_npy
 from nerg_mi.interruption import Interruption
@@ -243,6 +243,11 @@ class FrameRenderer:
         """Return the scene of a frame and the sensor."""
         loaded = self._scene.load(frame)
         self._stop.check()
+        for name in self._scene.unknown_objects:
+            self._reporter.warn(
+                f"{name_picture(self._num_done, self._num_frames)}the pose of the object "
+                f'"{sanitize(name, 40)}" is unknown then, and it is left out'
+            )
         if not self.observer_note and (note := describe_observer(loaded)):
             self.observer_note = note
             self._reporter.warn(name_picture(self._num_done, self._num_frames) + note)

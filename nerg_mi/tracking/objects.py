@@ -308,6 +308,11 @@ class ObjectPoses:
                 motion.assign(rows, track.find_motion(rays.t[rows], self.max_gap))
         return motion
 
+    def find_motion_at(self, name: str, time: float, person: str = "") -> Motion:
+        """Return the motion of the object ``name`` at one time, for a participant."""
+        track = self._tracks.get((person, name)) or self._tracks.get(("", name))
+        return Motion.unknown(1) if track is None else track.find_motion(np.array([float(time)]), self.max_gap)
+
     def describe_times(self) -> str:
         """Return the first and the last time."""
         times = self.times[np.isfinite(self.times)]

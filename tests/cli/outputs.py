@@ -265,7 +265,7 @@ MAKES_A_FOLDER = {"poses"}
 INPUTS = {
     "scene": {"environment", "photos", "align"},
     "view": {"areas", "align"},
-    "render": {"frames"},
+    "render": {"frames", "objects", "align"},
     "stats": {"aois", "align", "zones", "cohorts", "validation", "objects", "what_if", "salt"},
     "robustness": {"aois", "align", "zones", "cohorts", "validation"},
     "draw area": {"aois", "align", "objects"},
