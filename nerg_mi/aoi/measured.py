@@ -32,7 +32,8 @@ from .placed import (
 )
 from .settings import TrackerError, VisitRules
 from .shares import SamplePoints, VisibilityCache
-from .tracker_error import Disturbance, read_validation
+from .tracker_error import Disturbance
+from .validations import read_validation
 from .visits import ALL, Cell, Visits, VisitSums, find_visits, join_cells, make_timeline, sum_visits
 
 # ---- Cohorts ----

@@ -31,6 +31,7 @@ from .tables import (
     add_adjusted_p,
     explain_difference,
 )
+from .tracker_error import LEVELS, disturb_query
 from .visits import ALL, Cell
 
 # ---- Viewpoints ----
@@ -112,6 +113,8 @@ class PredictedAttention:
         Attention share by each ensemble member, (M, E, A); for a single field the share again.
     note
         Which viewpoints are extrapolated, and why; "" if none is.
+    disturbed
+        Attention share with the error of the eye tracker added once more, and twice, (2, E, A); None if it is ignored.
     """
 
     share: np.ndarray
@@ -120,6 +123,7 @@ class PredictedAttention:
     support: np.ndarray
     members: np.ndarray
     note: str = ""
+    disturbed: np.ndarray | None = None
 
 
 def subsample_participants(viewpoints: Viewpoints, max_participants: int, reporter: Reporter) -> Viewpoints:
@@ -142,24 +146,26 @@ def subsample_participants(viewpoints: Viewpoints, max_participants: int, report
 
 
 def predict_attention(
-    placed: PlacedAreas, viewpoints: Viewpoints, fov: float, reporter: Reporter = SILENT
+    placed: PlacedAreas, viewpoints: Viewpoints, fov: float, reporter: Reporter = SILENT, *, sigma: float = 0.0
 ) -> PredictedAttention:
     """Predict the attention of E viewpoints on areas, with a field of view of ``fov`` degrees. Requires a gaze field.
 
-    Small areas use more directions than those of ``placed.sampling``.
+    Small areas use more directions than those of ``placed.sampling``. With the standard deviation ``sigma`` of the
+    error of an eye tracker along an axis, in radians, the prediction is also made with this error added.
     """
-    assert placed.sampler is not None
+    sampler = placed.sampler
+    assert sampler is not None
     E, sampling = len(viewpoints.positions), placed.sampling
     on_progress = lambda done: reporter.progress(done / E, f"prediction: viewpoint {done} of {E}")
-    shares = gaze_shares(
-        placed.sampler.query_from,
-        viewpoints.positions,
-        placed.aois,
-        placed.members,
-        placed.margin,
-        replace(COARSE, initial_directions=sampling.directions),
-        on_progress,
-    )
+    rule = replace(COARSE, initial_directions=sampling.directions)
+    of_areas = viewpoints.positions, placed.aois, placed.members, placed.margin, rule, on_progress
+    shares, disturbed = gaze_shares(sampler.query_from, *of_areas), None
+    if sigma > 0:
+        # In a second sum, so that the prediction does not depend on the error. Differences between densities that are
+        # summed over the same directions have the smallest errors.
+        levels = gaze_shares(lambda eye: disturb_query(sampler.query_from(eye), sigma), *of_areas).members
+        recorded, *added = (members.mean(axis=0) for members in np.split(levels, 1 + len(LEVELS)))
+        disturbed = np.clip(shares.share + np.stack(added) - recorded, 0, 1)
     targets = SamplePoints.sample(placed.aois, sampling.aoi_samples)
     in_fov = visible_in_fov(
         targets,
@@ -169,8 +175,9 @@ def predict_attention(
         fov,
     )
     visible = np.stack([in_fov[:, list(indices)].any(axis=1) for indices in placed.members], axis=1)
-    support = np.array([placed.sampler.support_at(p) for p in viewpoints.positions])
-    return PredictedAttention(shares.share, shares.distance / placed.scale, visible, support, shares.members)
+    support = np.array([sampler.support_at(p) for p in viewpoints.positions])
+    distance = shares.distance / placed.scale
+    return PredictedAttention(shares.share, distance, visible, support, shares.members, disturbed=disturbed)
 
 
 def aggregate_by_participant(

@@ -407,8 +407,8 @@ def robustness(
     cohorts : path, optional
         CSV file with columns person,cohort; cohorts are compared. Default: the cohorts in the rays.
     validation : path, optional
-        CSV file with columns person,accuracy,precision in degrees: the errors of the eye tracker by participant, which
-        replace accuracy and precision.
+        Table of the errors of the eye tracker by participant in degrees, as for nerg stats; they replace accuracy and
+        precision.
     windows : mapping, optional
         Start and end of a time window by its name, NAME=FROM,TO in seconds of the rays' clock; windows are compared;
         repeatable.
@@ -475,7 +475,7 @@ def robustness(
         if gaze_inputs:
             gaze_fields = _open_gaze_fields([chosen.gaze, *gaze_inputs[1:]])
             if counting.has_error:
-                reporter.message("predictions do not depend on the error of the tracker")
+                reporter.message("predictions are not corrected for the error of the tracker, as nerg stats does")
             plain = replace(counting, error=TrackerError(), validation=None)
             observed = None if chosen.rays is None else open_recordings(chosen.rays)
             measured = AttentionAnalysis(

@@ -88,6 +88,12 @@ class TrackerError(ValidatedDataclass):
         "Precision of the eye tracker in degrees: the root mean square angle of the noise of a sample.",
         Range(0, 20),
     )
+    fixation_part: float = setting(
+        0.0,
+        "Part of the variance of the tracker's offset that changes from fixation to fixation. The rest is constant in "
+        "a session.",
+        Range(0, 1),
+    )
     draws: int = range_field(10, Range(2, 1000))
     """Number of random errors that the correction averages over."""
 

@@ -69,7 +69,7 @@ from .tables import (
     duration_rows,
     transition_rows,
 )
-from .tracker_error import resolution_rows, tracker_rows
+from .tracker_error import LEVELS, resolution_rows, tracker_rows
 from .visits import ALL, Cell, VisitSums, merge_sums
 
 
@@ -122,8 +122,9 @@ def statistics(
         CSV file with columns person,cohort; attention is reported separately for each cohort. Default: the cohorts in
         the rays.
     validation : path, optional
-        CSV file with columns person,accuracy,precision in degrees: the errors of the eye tracker by participant, which
-        replace accuracy and precision.
+        Table with columns person,accuracy,precision in degrees, or one of Tobii Pro Lab, Titta, glassesValidator or
+        ETDQualitizer: the errors of the eye tracker by participant, which replace accuracy and precision. A column
+        start, in seconds of the rays' clock, tells sessions apart.
     windows : mapping, optional
         Start and end of a time window by its name, NAME=FROM,TO in seconds of the rays' clock; attention is reported
         separately in it; repeatable.
@@ -491,10 +492,11 @@ class AttentionAnalysis:
             self.reporter.warn(note)
         # Without rays, orientations are unknown.
         fov = self.counting.fov if self.rays is not None else 360.0
+        sigma = self.counting.disturbance.sigma if self.counting.has_error and what_if is None else 0.0
         if self.parts is None:
-            predicted = predict_attention(placed, viewpoints, fov, self.reporter)
+            predicted = predict_attention(placed, viewpoints, fov, self.reporter, sigma=sigma)
         else:
-            predicted = self.parts.predict(viewpoints, fov, what_if)
+            predicted = self.parts.predict(viewpoints, fov, what_if, sigma=sigma)
         return replace(predicted, note=note)
 
     def make_tables(
@@ -514,8 +516,8 @@ class AttentionAnalysis:
             power_table = power_rows(names, people, suppression, power, seed=seed)
         differences = difference_rows(names, people, suppression, resamples=self.resamples, seed=seed)
         recorded: dict[str, Any] = {}
-        if attention.disturbed is not None:
-            recorded |= self._make_tracker_tables(attention.disturbed, attention.viewpoints.positions)
+        if self.counting.has_error:
+            recorded |= self._make_tracker_tables(attention)
         if sums is not None:
             recorded |= {
                 "transitions": transition_rows(sums, suppression),
@@ -524,11 +526,25 @@ class AttentionAnalysis:
             recorded["participants"] = self._list_participants(sums, show_names, salt)
         return StatisticsResult(aois=rows, differences=differences, power=power_table, sums=sums, **recorded)
 
-    def _make_tracker_tables(self, sums: VisitSums, observers: np.ndarray) -> dict[str, list[Row]]:
-        """Return the tables of the tracker's error, from sums with the disturbed samples."""
+    def _make_tracker_tables(self, attention: MeasuredAttention) -> dict[str, list[Row]]:
+        """Return the tables of the tracker's error."""
         self.reporter.progress(0.97, "error of the tracker")
         error, disturbance = self.counting.error, self.counting.disturbance
-        missing = [p for p in sums.find_participants(ALL)[1] if p not in disturbance.by_participant]
+        people: dict[Cell, dict[str, list[Participants]]] = {}
+        if (sums := attention.disturbed) is not None:
+            for of_draw in map(sums.select_draw, range(len(LEVELS) * error.draws + 1)):
+                for cell in of_draw.cells:
+                    of_cell = Participants.from_sums(of_draw, cell, has_visibility=False)
+                    people.setdefault(cell, {}).setdefault(MEASURED, []).append(of_cell)
+        if (predicted := attention.predicted) is not None and predicted.disturbed is not None:
+            for cell, times in attention.times.items():
+                for share in (predicted.share, *predicted.disturbed):
+                    level, duration = replace(predicted, share=share), self.placed.sampling.glance_duration
+                    of_cell = aggregate_by_participant(level, attention.viewpoints, cell, times, duration)
+                    if of_cell is not None:
+                        people.setdefault(cell, {}).setdefault(PREDICTED, []).append(of_cell)
+        tracked = [] if attention.sums is None else attention.sums.find_participants(ALL)[1]
+        missing = [p for p in tracked if p not in disturbance.by_participant]
         if disturbance.by_participant and missing:
             self.reporter.warn(
                 f'{len(missing):,} participants, such as "{sanitize(missing[0], 40)}", are not in the table of '
@@ -536,8 +552,8 @@ class AttentionAnalysis:
                 f"{error.precision:g} degrees"
             )
         names = self.placed.areas.names
-        corrected = tracker_rows(names, sums, error.draws, self.suppression, resamples=self.resamples, seed=self.seed)
-        too_small = resolution_rows(self.placed, observers, disturbance.mean_accuracy)
+        corrected = tracker_rows(names, people, self.suppression, resamples=self.resamples, seed=self.seed)
+        too_small = resolution_rows(self.placed, attention.viewpoints.positions, disturbance.mean_accuracy)
         if too_small:
             self.reporter.warn(
                 f"{len(too_small):,} areas or pairs, such as {too_small[0]['aoi']}, are smaller than twice the "

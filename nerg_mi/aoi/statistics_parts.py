@@ -111,6 +111,7 @@ class PlannedPrediction:
 
     areas: PlannedAreas
     fov: float
+    sigma: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -127,19 +128,20 @@ class ObserverPoses:
 
 
 VIEWPOINT_ARRAYS = ("share", "distance", "visible", "support")
-"""Arrays of a prediction with one row per viewpoint. ``members`` has an additional first axis."""
+"""Arrays of a prediction with one row per viewpoint. ``members`` and ``disturbed`` have an additional first axis."""
 
 
 def predict_part(common: PlannedPrediction, poses: ObserverPoses, output: Path) -> None:
     """Write the predicted attention (.npz) of some observers."""
     placed: PlacedAreas = prepare_once(common, common.areas.open)
-    write_prediction(output, predict_attention(placed, poses.to_viewpoints(), common.fov))
+    write_prediction(output, predict_attention(placed, poses.to_viewpoints(), common.fov, sigma=common.sigma))
 
 
 def write_prediction(path: Path, predicted: PredictedAttention) -> None:
     """Write a prediction (.npz), as `read_prediction` reads it."""
+    names = (*VIEWPOINT_ARRAYS, "members", *([] if predicted.disturbed is None else ["disturbed"]))
     with replace_atomically(path) as temporary, temporary.open("wb") as out:
-        np.savez(out, **{name: getattr(predicted, name) for name in (*VIEWPOINT_ARRAYS, "members")})
+        np.savez(out, **{name: getattr(predicted, name) for name in names})
 
 
 def write_sums(path: Path, sums_of_blocks: list[VisitSums]) -> None:
@@ -253,9 +255,11 @@ class PartitionedStatistics:
             for output in self.parts.run(self.make_plan(self.job_name, count_part, common, parts), 0.0, end):
                 yield from read_sums(output.path)
 
-    def predict(self, viewpoints: Viewpoints, fov: float, changes: Any = None) -> PredictedAttention:
+    def predict(
+        self, viewpoints: Viewpoints, fov: float, changes: Any = None, *, sigma: float = 0.0
+    ) -> PredictedAttention:
         """Predict the attention of ``viewpoints`` with a field of view of ``fov`` degrees, after ``changes``, those of
-        a file or a dict."""
+        a file or a dict; ``sigma`` is that of `predict_attention`."""
         areas, job_name = self.plan_areas("margin", "aoi_samples", "directions"), f"{self.job_name} (prediction)"
         start, end = _PROGRESS_COUNTED, _PROGRESS_PREDICTED
         if changes is not None:
@@ -270,10 +274,13 @@ class PartitionedStatistics:
                 viewpoints.positions[a : a + VIEWPOINTS_PER_PART], viewpoints.facing[a : a + VIEWPOINTS_PER_PART]
             )
             parts.append(Part(poses, f"viewpoints {a + 1} to {a + len(poses.positions)}"))
-        plan = self.make_plan(job_name, predict_part, PlannedPrediction(areas, fov), parts)
+        plan = self.make_plan(job_name, predict_part, PlannedPrediction(areas, fov, sigma), parts)
         predictions = [read_prediction(output.path) for output in self.parts.run(plan, start, end)]
         arrays = {name: np.concatenate([getattr(f, name) for f in predictions]) for name in VIEWPOINT_ARRAYS}
-        return PredictedAttention(**arrays, members=np.concatenate([f.members for f in predictions], axis=1), note="")
+        members = np.concatenate([f.members for f in predictions], axis=1)
+        levels = [f.disturbed for f in predictions if f.disturbed is not None]
+        disturbed = np.concatenate(levels, axis=1) if levels else None
+        return PredictedAttention(**arrays, members=members, note="", disturbed=disturbed)
 
     def make_plan(self, job_name: str, work: Callable, common: Any, parts: list[Part]) -> Plan:
         """Plan ``parts`` that ``work`` computes."""

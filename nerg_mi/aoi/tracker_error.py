@@ -6,60 +6,32 @@ import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.environment.arrays import join_names
-from nerg_mi.errors import NergError, sanitize
-from nerg_mi.files.values import to_name
+from nerg_mi.environment.sampler import DirectionQuery
+from nerg_mi.tracking.events import detect_fixations_ivt
 from nerg_mi.tracking.rays import Rays
-from nerg_mi.tracking.readers.columns import open_named_table
 
 from .estimates import estimate_ratios
 from .placed import PlacedAreas
 from .settings import TrackerError, VisitRules
-from .tables import MEASURES_BY_NAME, NO_INTERVAL, Measure, MinParticipantsFilter, Participants, Row
-from .visits import VisitSums, make_timeline
+from .tables import MEASURES_BY_NAME, NO_INTERVAL, MinParticipantsFilter, Participants, Row
+from .validations import Validation, Validations
+from .visits import Cell, make_timeline
 
 # ---- Disturbed samples ----
 #
-# A recorded direction is the true one turned by an offset, constant in a session, and by noise of its own. Both are
-# normally distributed in two dimensions. *Accuracy* is the mean angle of the offset, sqrt(pi / 2) times its standard
-# deviation along an axis; *precision* is the root mean square angle of the noise, sqrt(2) times that deviation.
+# A recorded direction is the true one turned by an offset, constant in a session, by another one, constant in a
+# fixation, and by noise of its own. All are normally distributed in two dimensions. *Accuracy* is the mean angle of
+# both offsets, sqrt(pi / 2) times their standard deviation along an axis; *precision* is the root mean square angle of
+# the noise, sqrt(2) times that deviation.
 
 OFFSET_SCALE, NOISE_SCALE = np.sqrt(2 / np.pi), np.sqrt(1 / 2)
 LEVELS = (1, 2)
 """Variances of the added error, in units of the tracker's."""
 
-MAX_ANGLE = 20.0  # degrees
-
-
-def read_validation(path: Path) -> dict[str, tuple[float, float]]:
-    """Read accuracy and precision in degrees by participant from a table of validations.
-
-    Its columns are person, accuracy, and precision or ``std``, as in the table of data quality of `nerg rays events`.
-    Several rows of a participant are averaged, and rows without accuracy are ignored; an unknown precision is NaN.
-    Raises `NergError` for missing columns and for values outside of 0 to 20 degrees.
-    """
-    values: dict[str, list[list[float]]] = {}
-    present, blocks = open_named_table(
-        path, ("accuracy", "precision", "std"), ("person",), optional=("precision", "std")
-    )
-    columns = [present.index(name) for name in ("accuracy", *[n for n in ("precision", "std") if n in present][:1])]
-    for block in blocks:
-        for row, (text,) in zip(block.numbers[:, columns].tolist(), block.texts.tolist()):
-            if not all(0 <= value <= MAX_ANGLE for value in row if not np.isnan(value)):
-                raise NergError(
-                    f'"{path}" has {join_names([f"{value:g}" for value in row])} degrees for "{sanitize(text, 40)}"; '
-                    f"accuracy and precision must be numbers from 0 to {MAX_ANGLE:g}"
-                )
-            if not np.isnan(row[0]):
-                values.setdefault(to_name(text), []).append([*row, np.nan][:2])
-    if not values:
-        raise NergError(f'"{path}" contains no accuracy; write the header person,accuracy,precision and one row each')
-    means = {name: np.mean(rows, axis=0).tolist() for name, rows in values.items()}
-    return {name: (accuracy, precision) for name, (accuracy, precision) in means.items()}
+_RING_DIRECTIONS = 6  # number of directions around the central one
 
 
 @dataclass(frozen=True)
@@ -71,17 +43,38 @@ class Disturbance:
     error
         Accuracy, precision and the number of draws.
     by_participant
-        Accuracy and precision in degrees of single participants, which replace those of ``error``.
+        Validations of single participants, whose accuracy and precision replace those of ``error``.
     """
 
     error: TrackerError
-    by_participant: Mapping[str, tuple[float, float]]
+    by_participant: Validations
 
     @property
     def mean_accuracy(self) -> float:
         """Accuracy in degrees, averaged over the participants of the table."""
-        values = [accuracy for accuracy, _ in self.by_participant.values()]
-        return float(np.mean(values)) if values else self.error.accuracy
+        return float(np.mean([accuracy for accuracy, _ in self._errors()]))
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation along an axis, in radians, of the error of a sample of any participant."""
+        accuracy, precision = np.radians(self._errors()).T
+        return float(np.sqrt(np.mean((OFFSET_SCALE * accuracy) ** 2 + (NOISE_SCALE * precision) ** 2)))
+
+    def _errors(self) -> list[tuple[float, float]]:
+        """Return accuracy and precision of all validations, or those of ``error`` without any."""
+        rows = [self._fill(v) for validations in self.by_participant.values() for v in validations]
+        return rows or [(self.error.accuracy, self.error.precision)]
+
+    def _fill(self, validation: Validation) -> tuple[float, float]:
+        precision = validation.precision
+        return validation.accuracy, self.error.precision if np.isnan(precision) else precision
+
+    def _find_error(self, participant: str, start: float) -> tuple[float, float]:
+        """Return accuracy and precision in degrees of a session, by the validation nearest to its ``start``."""
+        validations = self.by_participant.get(participant)
+        if not validations:
+            return self.error.accuracy, self.error.precision
+        return self._fill(min(validations, key=lambda v: abs(v.start - start)))
 
     def draw(self, rays: Rays, rules: VisitRules) -> Iterator[Rays]:
         """Yield the samples with an added error: all draws of the first of `LEVELS`, then those of the second.
@@ -92,20 +85,34 @@ class Disturbance:
         session = make_timeline(rays.person, rays.t, rules).session
         starts = np.flatnonzero(np.diff(session, prepend=-1))
         ends = np.r_[starts[1:], len(session)]
-        usual = (self.error.accuracy, self.error.precision)
+        part = self.error.fixation_part
+        first = find_first_of_fixation(rays) if part > 0 else np.arange(len(rays))
         for level in LEVELS:
             for draw in range(self.error.draws):
                 angles = np.empty((len(rays), 2))
                 for start, end in zip(starts.tolist(), ends.tolist()):
-                    name = rays.persons[rays.person[start]]
-                    accuracy, precision = np.radians(self.by_participant.get(name, usual))
-                    precision = np.radians(self.error.precision) if np.isnan(precision) else precision
+                    name, time = rays.persons[rays.person[start]], float(rays.t[start])
+                    accuracy, precision = np.radians(self._find_error(name, time))
                     # Both levels use the same numbers, so that less noise remains in their difference.
-                    rng = np.random.default_rng((zlib.crc32(name.encode()), abs(hash(float(rays.t[start]))), draw))
-                    offset = OFFSET_SCALE * accuracy * rng.standard_normal(2)
+                    rng = np.random.default_rng((zlib.crc32(name.encode()), abs(hash(time)), draw))
+                    offset = np.sqrt(1 - part) * rng.standard_normal(2)
                     noise = NOISE_SCALE * precision * rng.standard_normal((end - start, 2))
-                    angles[start:end] = np.sqrt(level) * (offset + noise)
+                    if part > 0:
+                        row = np.maximum(first[start:end], start) - start
+                        offset = offset + np.sqrt(part) * rng.standard_normal((end - start, 2))[row]
+                    angles[start:end] = np.sqrt(level) * (OFFSET_SCALE * accuracy * offset + noise)
                 yield replace(rays, direction=turn_directions(rays.direction, angles))
+
+
+def find_first_of_fixation(rays: Rays) -> np.ndarray:
+    """Return the index (N,) of the first sample of the fixation that each sample belongs to (I-VT with its defaults),
+    its own outside of fixations. ``rays`` are sorted by participant and time."""
+    label = detect_fixations_ivt(rays)
+    rows = np.flatnonzero(label >= 0)
+    _, index, number = np.unique(label[rows], return_index=True, return_inverse=True)
+    first = np.arange(len(rays))
+    first[rows] = rows[index][number]
+    return first
 
 
 def turn_directions(directions: np.ndarray, angles: np.ndarray) -> np.ndarray:
@@ -122,6 +129,28 @@ def turn_directions(directions: np.ndarray, angles: np.ndarray) -> np.ndarray:
     return np.cos(angle) * directions + np.sinc(angle / np.pi) * tangent
 
 
+def disturb_query(query: DirectionQuery, sigma: float) -> DirectionQuery:
+    """Return a query of the gaze density (3 M, N) of M ensemble members without an added error, and with one of each of
+    `LEVELS`, whose unit is the standard deviation ``sigma`` along an axis in radians.
+
+    The density is convolved with the error by a rule of seven directions, as in `nerg_mi.surfaces.sources`.
+    """
+
+    def query_levels(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+        gaze, depth = query(directions)
+        densities = [gaze]
+        for level in LEVELS:
+            ring = np.zeros_like(gaze)
+            for k in range(_RING_DIRECTIONS):
+                azimuth = 2 * np.pi * k / _RING_DIRECTIONS
+                angles = 2 * sigma * np.sqrt(level) * np.array([np.cos(azimuth), np.sin(azimuth)])
+                ring += query(turn_directions(directions, np.broadcast_to(angles, (len(directions), 2))))[0]
+            densities.append(gaze / 2 + ring / (2 * _RING_DIRECTIONS))
+        return np.concatenate(densities), depth
+
+    return query_levels
+
+
 # ---- Extrapolation to no error ----
 #
 # Simulation extrapolation (Cook and Stefanski 1994): the mean f(v) of a measure over draws with added error of variance
@@ -133,22 +162,27 @@ CORRECTED_MEASURES = ("share", "dwell", "hit_ratio", "time_to_first_visit")
 
 
 def tracker_rows(
-    areas: Sequence[str], sums: VisitSums, draws: int, suppression: MinParticipantsFilter, *, resamples: int, seed: int
+    areas: Sequence[str],
+    people: Mapping[Cell, Mapping[str, Sequence[Participants]]],
+    suppression: MinParticipantsFilter,
+    *,
+    resamples: int,
+    seed: int,
 ) -> list[Row]:
-    """Return a row for each cell, area and corrected measure of ``sums``, which contain the draws.
+    """Return a row for each cell, area, source and corrected measure.
 
-    ``recorded`` is the value of the samples, ``disturbed`` the mean of those with the error added once more, and
-    ``corrected``, with ``low`` and ``high``, is extrapolated to no error.
+    ``people`` are the participants of each cell and source without an added error, then those of all draws of each of
+    `LEVELS`. ``recorded`` is the value without an added error, ``disturbed`` the mean of those with the error added
+    once more, and ``corrected``, with ``low`` and ``high``, is extrapolated to no error.
     """
-    recorded = sums.select_draw(0)
-    disturbed = [sums.select_draw(draw) for draw in range(1, len(LEVELS) * draws + 1)]
     rows: list[Row] = []
-    for cell in recorded.cells:
-        people = [Participants.from_sums(s, cell, has_visibility=False) for s in (recorded, *disturbed)]
-        for name in CORRECTED_MEASURES:
-            measure = MEASURES_BY_NAME[name]
-            values = np.stack([_influence(measure, p) for p in people])
-            first, once, twice = values[0], values[1 : draws + 1].mean(axis=0), values[draws + 1 :].mean(axis=0)
+    for cell, source, draws in ((c, s, draws) for c, sources in people.items() for s, draws in sources.items()):
+        for measure in (MEASURES_BY_NAME[name] for name in CORRECTED_MEASURES):
+            pairs = [pair for pair in map(measure.numerator_denominator, draws) if pair is not None]
+            if not pairs:  # a gaze field has no time course
+                continue
+            values = np.stack([_influence(x, y) for x, y in pairs])
+            first, (once, twice) = values[0], (v.mean(axis=0) for v in np.split(values[1:], len(LEVELS)))
             extrapolated = 3 * first - 3 * once + twice
             is_known = np.isfinite(extrapolated).all(axis=0)
             estimate = estimate_ratios(
@@ -162,9 +196,9 @@ def tracker_rows(
             columns["corrected"] = np.clip(estimate.value, 0.0, measure.upper_limit)
             columns |= {"low": estimate.low, "high": estimate.high}
             for a, area in enumerate(areas):
-                row: Row = {"cell": cell.dimension, "value": cell.value, "aoi": area, "measure": name}
+                row: Row = {"cell": cell.dimension, "value": cell.value, "aoi": area, "source": source}
                 is_allowed = suppression.admit(len(first))
-                row["participants"] = len(first) if is_allowed else None
+                row |= {"measure": measure.name, "participants": len(first) if is_allowed else None}
                 for key, column in columns.items():
                     is_shown = is_allowed and np.isfinite(column[a]) and (is_known[a] or key == "recorded")
                     row[key] = float(column[a]) if is_shown else None
@@ -173,11 +207,9 @@ def tracker_rows(
     return rows
 
 
-def _influence(measure: Measure, people: Participants) -> np.ndarray:
-    """Return values (P, A) whose mean over participants is the measure, with the spread of its linearised error."""
-    pair = measure.numerator_denominator(people)
-    assert pair is not None
-    x, y = pair
+def _influence(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return values (P, A) whose mean over participants is the ratio of the sums of ``x`` and ``y`` (P, A), with the
+    spread of its linearised error."""
     total = y.sum(axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
         value = np.where(total > 0, x.sum(axis=0) / total, np.nan)

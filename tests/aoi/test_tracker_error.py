@@ -7,11 +7,12 @@ from statistics import NormalDist
 import numpy as np
 import pytest
 
-from nerg_mi.aoi.settings import TrackerError, VisitRules
+from nerg_mi.aoi.settings import AoiSampling, TrackerError, VisitRules
 from nerg_mi.aoi.statistics import statistics
-from nerg_mi.aoi.tracker_error import Disturbance, read_validation, turn_directions
-from nerg_mi.errors import NergError
+from nerg_mi.aoi.tracker_error import Disturbance, disturb_query, turn_directions
+from nerg_mi.aoi.validations import Validation, read_validation
 from nerg_mi.tracking.rays import Rays
+from tests.aoi.place import people, write_place
 from tests.recorder import Recorder
 
 RULES = VisitRules(min_visit=0.0)
@@ -63,9 +64,21 @@ def test_offsets_have_the_accuracy_and_noise_the_precision():
     assert np.sqrt((noise[4:] ** 2).mean()) == pytest.approx(0.5 * np.sqrt(2), rel=0.03)
 
 
+def test_a_part_of_the_offset_changes_from_fixation_to_fixation():
+    # Two fixations of five samples at 50 Hz, 20 degrees apart.
+    rays = look(np.repeat([[0.0] * 5 + [20.0] * 5], 400, axis=0), times=np.arange(10) / 50)
+    for part in (0.0, 0.25, 1.0):
+        some = draws_of(rays, TrackerError(accuracy=2.0, fixation_part=part, draws=2))
+        right = np.stack([np.degrees(np.arctan2(-d.direction[:, 1], d.direction[:, 0])) for d in some[:2]])
+        offset = right.reshape(-1, 2, 5) - np.array([0.0, 20.0])[:, None]
+        assert np.allclose(offset, offset[..., :1], atol=1e-3)
+        assert angle(rays.direction, some[0].direction).mean() == pytest.approx(2.0, rel=0.1)
+        assert np.corrcoef(offset[:, :, 0].T)[0, 1] == pytest.approx(1 - part, abs=0.1)
+
+
 def test_draws_do_not_depend_on_the_other_sessions():
-    rays = look(np.zeros((3, 8)), times=np.r_[0:4, 1000:1004] / 1.0)
-    error = TrackerError(accuracy=1.0, precision=0.3, draws=2)
+    rays = look(np.zeros((3, 8)), times=np.r_[0:4, 5000:5004] / 50)
+    error = TrackerError(accuracy=1.0, precision=0.3, fixation_part=0.5, draws=2)
     for rows in (np.arange(8, 16), np.arange(4, 8), np.r_[0:4, 16:24]):
         some = draws_of(rays.select(rows), error)
         for part, whole in zip(some, draws_of(rays, error)):
@@ -90,6 +103,53 @@ def test_correction_matches_the_closed_form():
     for row in result.tracker:
         if row["measure"] in ("share", "hit_ratio"):
             assert row["corrected"] == pytest.approx(0.5, abs=0.01) and row["low"] < 0.5 < row["high"]
+
+
+def test_shares_match_the_closed_form_on_a_plane():
+    # Each participant looks at one point of a wall, on which errors of a few degrees are even: the probability of a
+    # rectangle is a product of differences of the normal distribution function.
+    at = np.random.default_rng(2).uniform(-4, 4, (2, 2000))
+    sides = np.array([[-2.0, 1.0], [-1.0, 3.0]])  # degrees to the right, and up
+    (left, right), (low, high) = 5 * np.tan(np.radians(sides))
+    wall = {"rectangle": {"min": [4.99, -right, low], "max": [5.01, -left, high]}}
+    rays, error = look(*np.repeat(at[:, :, None], 2, axis=2)), TrackerError(accuracy=1.5, draws=10)
+    row = statistics(rays, wall, rules=RULES, error=error, resamples=199).tracker[0]
+    recorded = ((at > sides[:, :1]) & (at < sides[:, 1:])).all(axis=0)
+    assert row["measure"] == "share" and row["recorded"] == pytest.approx(recorded.mean(), abs=0.004)
+    cdf = np.vectorize(NormalDist(0, 1.5 * np.sqrt(2 / np.pi)).cdf)
+    expected = (cdf(sides[:, 1:] - at) - cdf(sides[:, :1] - at)).prod(axis=0)
+    assert row["disturbed"] == pytest.approx(expected.mean(), abs=0.005)
+
+
+def test_densities_with_an_error_match_the_closed_form():
+    # The error multiplies a spherical harmonic of degree l by exp(-l (l + 1) sigma² / 2).
+    harmonic = lambda d: 35 * d[:, 0] ** 4 - 30 * d[:, 0] ** 2 + 3
+    directions = np.random.default_rng(0).normal(size=(200, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    sigma = np.radians(3.0)
+    densities, depth = disturb_query(lambda d: (np.stack([harmonic(d), np.ones(len(d))]), d[:, 0]), sigma)(directions)
+    value = harmonic(directions)
+    assert np.array_equal(depth, directions[:, 0]) and np.allclose(densities[1::2], 1)
+    assert np.array_equal(densities[0], value)
+    for density, level in ((densities[2], 1), (densities[4], 2)):
+        assert np.allclose(density, np.exp(-10 * level * sigma**2) * value, atol=1e-3)
+
+
+def test_predictions_are_corrected(tmp_path, rgb):
+    scene, areas, error = write_place(tmp_path), tmp_path / "areas.json", TrackerError(accuracy=4.0, draws=2)
+    options = {"sampling": AoiSampling(directions=128, aoi_samples=6), "viewpoints": 20, "resamples": 199}
+    for inputs in ([scene, people()], [scene]):  # with and without participants
+        plain, result = (statistics(inputs, areas, error=e, **options) for e in (TrackerError(), error))
+        assert result.aois == plain.aois and not plain.tracker
+        assert {r["aoi"] for r in result.resolution} <= {"the sign", "the stand"}
+        rows = [r for r in result.tracker if r["source"] == "predicted"]
+        assert {r["measure"] for r in rows} == {"share", "dwell", "hit_ratio"}
+        shares = {(r["cell"], r["value"], r["aoi"]): r["share"] for r in result.aois if r["source"] == "predicted"}
+        for row in rows:
+            assert row["low"] <= row["corrected"] <= row["high"]
+            if row["measure"] == "share":
+                assert row["recorded"] == pytest.approx(shares[row["cell"], row["value"], row["aoi"]])
+                assert row["recorded"] != row["disturbed"]
 
 
 def simulate(rng, shares, num, count, spread, sd, noise):
@@ -137,10 +197,6 @@ def test_small_areas_and_close_neighbours_are_named():
 def test_a_table_replaces_the_error_of_participants(tmp_path):
     file = tmp_path / "validation.csv"
     file.write_text("participant,accuracy,precision\np0001,3,0\np0001,1,0\n")
-    assert read_validation(file) == {"p0001": (2.0, 0.0)}
-    file.write_text("participant,std,accuracy\na,0.2,1\nb,,1\nc,0.2,\n")  # a table of data quality
-    assert read_validation(file) == {"a": (1.0, 0.2), "b": (1.0, pytest.approx(np.nan, nan_ok=True))}
-    file.write_text("participant,accuracy,precision\np0001,3,0\np0001,1,0\n")
     rays = look(np.zeros((2, 4)))
     some = draws_of(rays, TrackerError(draws=2), by_participant=read_validation(file))
     moved = angle(rays.direction, some[0].direction)
@@ -148,15 +204,17 @@ def test_a_table_replaces_the_error_of_participants(tmp_path):
     recorder = Recorder()
     result = statistics(rays, EDGE, rules=RULES, validation=file, resamples=199, progress=recorder)
     assert result.tracker and any('"p0000"' in text for text in recorder.warnings)
-    for text in (
-        "person,accuracy,precision\np0001,21,0\n",
-        "person,accuracy,precision\np0001,-1,0\n",
-        "person,precision\na,1\n",
-        "person,accuracy\na,\n",
-    ):
-        file.write_text(text)
-        with pytest.raises(NergError):
-            statistics(rays, EDGE, rules=RULES, validation=file, resamples=199)
+
+
+def test_a_session_has_the_nearest_validation():
+    rays = look(np.zeros((1, 8)), times=np.r_[10:14, 1000:1004] / 1.0)
+    validations = {"p0000": [Validation(998.0, 0.0, np.nan), Validation(14.0, 2.0, 0.0)]}
+    disturbance = Disturbance(TrackerError(precision=0.5, draws=2), validations)
+    assert disturbance.mean_accuracy == 1
+    assert disturbance.sigma == pytest.approx(np.radians(np.sqrt((2.0**2 * 2 / np.pi + 0.5**2 / 2) / 2)))
+    moved = angle(rays.direction, next(disturbance.draw(rays, RULES)).direction)
+    assert np.allclose(moved[:4], moved[0]) and moved[0] > 0
+    assert len(np.unique(moved[4:])) == 4 and (moved[4:] < 2).all()
 
 
 def test_without_an_error_nothing_is_added():
