@@ -53,10 +53,11 @@ With 4,096 Gaussians or more, rays of perspective cameras, panoramas and observe
 direction, as rasterisers do, instead of searching a tree, in a third to a tenth of the time. Three things differ.
 Gaussians are sorted by the distances of their centres, and by their peaks only among each nine successive ones. Colours
 are those in the directions of the centres, as in 3DGS. Gaussians that absorb less than 1/255 of the light are left out.
-Other rays, derivatives and functions that ``dr.freeze`` records use the tree.
+Other rays, such as batches of random pixels of several cameras, and functions that ``dr.freeze`` records use the tree.
 
-Derivatives reach the Gaussians, cameras and observers as for a radiance field, with memory that does not grow with the
-number of hits. They ignore changes of the set of Gaussians along a ray and of their order.
+Derivatives reach the Gaussians, cameras and observers as for a radiance field, from the lists or the tree that the rays
+read, with memory that does not grow with the number of hits. They ignore changes of the set of Gaussians along a ray
+and of their order.
 
 .. tabs::
     .. code-tab:: xml

@@ -235,9 +235,8 @@ class SceneGeometry:
         to_world = self.medium.to_world
         turn = to_world.matrix[:3, :3] / to_world.scale
         local = tuple(w._replace(axes=w.axes @ turn) for w in windows)
-        position = np.array(to_world.point_to_local(dr.detach(center)), np.float64).ravel()
         seen = copy(self)
-        seen.medium = list_splats(self.medium, position, rays, local)
+        seen.medium = list_splats(self.medium, to_world.point_to_local(center), rays, local)
         return seen
 
     def trace(self, ray: Ray3f | SceneRay, active: Bool, settings: MarchSettings, **options: Any) -> RayHit:

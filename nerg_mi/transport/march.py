@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -27,9 +28,9 @@ from .march_primal import (
     optical_depth_limits,
     zero_sums,
 )
-from .medium import Hits, LocalRay, Medium, SampleShader
+from .medium import ColorShader, Hits, LocalRay, Medium, SampleShader
 from .quadrature import absorbed_fraction
-from .splat_lists import SplatLists
+from .splat_lists import ListHit, ListSums, SplatLists, light_limits
 
 # ---- Derivatives of a march in steps ----
 #
@@ -56,7 +57,9 @@ def march_differentiably(
     # Each sample is shaded separately: a shared colour would send its gradient to the wrong samples.
     settings = replace(request.settings, color_cutoff=0.0)
     request = replace(request, settings=settings, occlusion=None)
-    result = dr.custom(operation, ray.o, ray.d, ray.w, t0, t1, request)
+    inputs = ray.o, ray.d, ray.w, t0, t1
+    attached = tuple(name for name, value in zip(_INPUTS, inputs) if dr.grad_enabled(value))
+    result = dr.custom(operation, *inputs, request, attached)
     for name in ("median_depth_slope", "crossing_start", "crossing_start_tau"):
         setattr(result, name, dr.detach(getattr(result, name)))
     return result
@@ -95,9 +98,11 @@ class ReplayStep:
 class MarchOp(dr.CustomOp):
     """A march as one node of the AD graph: `march_primal` for the values, a second march for the derivatives."""
 
-    def eval(self, o, d, w, t0, t1, request):
+    def eval(self, o, d, w, t0, t1, request, attached):
         self.request: MarchRequest = request
         self.inputs = (o, d, w, t0, t1)
+        # Names of the inputs that carry derivatives.
+        self.attached: tuple[str, ...] = attached
         # The medium's weights are read and not passed as inputs, so the graph has to be told about them.
         for parameter in request.medium.parameters():
             self.add_input(parameter)
@@ -130,11 +135,13 @@ class MarchOp(dr.CustomOp):
                     dr.select(step.has_crossing, step.crossing_distance, 0),
                 )
                 dr.backward_from(dr.select(step.active, f + d_half * h, 0))
-                grads = [g + dr.grad(x) for g, x in zip(grads, leaves)]
+                grads = [g + dr.grad(leaves[i]) for g, i in zip(grads, wanted)]
             return state, grads
 
-        zeros = [dr.zeros(type(x), dr.width(x)) for x in self.inputs]
-        for name, g in zip(_INPUTS, self._march_again(visit, zeros)):
+        # Sums that nothing needs would slow down the loop.
+        wanted = [_INPUTS.index(name) for name in self.attached]
+        zeros = [dr.zeros(type(self.inputs[i]), dr.width(self.inputs[i])) for i in wanted]
+        for name, g in zip(self.attached, self._march_again(visit, zeros)):
             self.set_grad_in(name, g)
 
     def forward(self):
@@ -272,6 +279,51 @@ class HitMarchOp(MarchOp):
         )
 
 
+# ---- Derivatives of a march along lists of Gaussians ----
+#
+# As above, with the hits, the order and the end of `SplatLists.march`. Derivatives reach the rows of the lists, one per
+# Gaussian, and from there, outside of the loop, the shapes and colours of the Gaussians. Rays pass through the
+# viewpoint of the lists, so a change of a ray is a change of its direction and a shift of that point.
+
+
+class ListMarchOp(MarchOp):
+    """`SplatLists.march` as one node of the AD graph; the lists of the request's medium are attached."""
+
+    def eval(self, o, d, w, t0, t1, request, attached):
+        self.lists: SplatLists = request.medium.hits
+        self.add_input(self.lists.rows)
+        return super().eval(o, d, w, t0, t1, request, attached)
+
+    @staticmethod
+    def _primal(ray: LocalRay, t0: Float, t1: Float, request: MarchRequest) -> MarchResult:
+        return cast("SplatLists", request.medium.hits).march(ray, t0, t1, request)
+
+    def _march_again(self, visit: Callable[..., tuple[Any, Any]], extra: Any) -> Any:
+        f, ray, Float = self.request, LocalRay(*self.inputs), type(self.inputs[3])
+        self.offset, self.limits = self.lists.distance_to(ray), light_limits(Float, f)
+        color = None if f.color is None else f.color.zero()
+        start = ListSums(active=f.active, light=Float(1), moment=Float(0), color=color)
+        t0, t1 = (t + self.offset for t in self.inputs[3:])
+        with dr.suspend_grad(), dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, True):
+            return self.lists.loop_hits(ray, t0, t1, start, visit, extra)[1]
+
+    def _replay(self, leaves: list[Any], state: Any, place: ListHit) -> tuple[ReplayStep, Any]:
+        lists, active, shader = self.lists, state.active, self.request.color
+        (o, d, _, t0, _), (primal_o, primal_d, _, primal_t0, _) = leaves, self.inputs
+        shift = (o - primal_o) - self.offset * (d - primal_d)
+        t, alpha, _ = lists.evaluate(place.rank, d, shift, active)
+        goal, stop = self.limits
+        after, weight, crosses = state.absorb(place, primal_t0 + self.offset, goal, stop)
+        color = None
+        if shader is not None:
+            color = lists.color(place.rank, cast("ColorShader", shader), active)
+            after.color = state.color + weight * dr.detach(color)
+        distance = t - self.offset
+        dtau = dr.select(active, -log1p(-alpha), 0)
+        before = active & (after.light > goal)
+        return ReplayStep(active, dtau, distance - t0, color, state.light, before, crosses, distance), after
+
+
 # ---- March ----
 #
 # Volume rendering along rays: the plain march, or the differentiable one if anything carries gradients, with an
@@ -328,7 +380,13 @@ def march(
     t0, t1 = Float(t0), Float(t1)
     request = MarchRequest(medium, active, settings, offset, color, count, until, fine_from, occlusion)
     if any(dr.grad_enabled(x) for x in (ray.o, ray.d, ray.w, t0, t1, *medium.parameters())):
-        result = march_differentiably(MarchOp if medium.hits is None else HitMarchOp, ray, t0, t1, request)
+        operation: type[MarchOp] = MarchOp if medium.hits is None else HitMarchOp
+        # Rows have colours alone.
+        if isinstance(medium.hits, SplatLists) and (color is None or isinstance(color, ColorShader)):
+            seen: Any = copy(medium)
+            seen.hits = medium.hits.attach()
+            operation, request = ListMarchOp, replace(request, medium=seen)
+        result = march_differentiably(operation, ray, t0, t1, request)
     else:
         # An enclosing derivative, such as that of the albedo of a shape, evaluates loops: each step would be a kernel.
         with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, True):

@@ -4,25 +4,30 @@ Rays of a camera, or of an observer, start at one point. The directions around i
 the list of the Gaussians that its rays can meet, sorted by the distance of their centres (tiles of Kerbl et al. 2023,
 "3D Gaussian Splatting"). A ray reads the list of its cell, where the tree of `splat_medium` would search. Gaussians are
 evaluated exactly along the ray. What differs from the tree: their order on a ray is that of their centres, their colour
-is that in the direction of their centre, and those that absorb less than `MIN_ALPHA` are left out.
+is that in the direction of their centre, and those that absorb less than `MIN_ALPHA` are left out. Derivatives are
+those of the same sums: a ray reads its list again (`march.ListMarchOp`).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import drjit as dr
 import numpy as np
 
 from nerg_mi.maths.arrays import copy_aligned
-from nerg_mi.maths.types import Bool, Float, UInt32, Vector3f
+from nerg_mi.maths.types import Bool, Color, Float, Point3f, UInt32, Vector3f
 
 from .jit import Fingerprint
 from .march_primal import MarchRequest, MarchResult, optical_depth_limits
 from .medium import ColorShader, LocalRay
 from .splat_medium import SHAPE_SIZE, SplatArrays, SplatHits, SplatMedium, find_peak
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 MIN_ALPHA = 1 / 255
 """Absorbed fraction below which a Gaussian is left out, as in 3DGS."""
@@ -62,10 +67,11 @@ def cube_windows(cells: int) -> tuple[Window, ...]:
 class SplatLists(SplatHits):
     """The lists of the cells of ``windows`` (one, or the six of `cube_windows`) around ``center``.
 
-    ``center`` (3,) in the frame of the Gaussians ``arrays``. Derivatives are those of the tree.
+    ``center`` (3,) in the frame of the Gaussians ``arrays``.
     """
 
-    UNRECORDED = ("size",)
+    # Read with derivatives only, or never by traced programs.
+    UNRECORDED = ("size", "viewpoint")
 
     def __init__(self, arrays: SplatArrays, center: np.ndarray, windows: tuple[Window, ...]):
         super().__init__(arrays)
@@ -75,6 +81,8 @@ class SplatLists(SplatHits):
         self.center = ns.Array3f(*(float(c) for c in center))
         # Literals would compile kernels for each viewpoint.
         dr.make_opaque(self.center)
+        # The centre with its derivatives.
+        self.viewpoint = self.center
         with dr.suspend_grad():
             bounds = [self._find_cells(window) for window in windows]
             order = self._sort_visible(np.any([b.count > 0 for b in bounds], axis=0))
@@ -87,7 +95,8 @@ class SplatLists(SplatHits):
             self.size = ROW_SIZE * len(order) + int(starts[-1][-1])
             self._starts = ns.UInt32(copy_aligned(np.concatenate(starts), np.uint32))
             self._entries = ns.UInt32(copy_aligned(np.concatenate([*ranks, np.zeros(1, np.int32)]), np.uint32))
-            self._rows, self._indices = self._make_rows(ns.UInt32(copy_aligned(order, np.uint32)))
+            self._indices = ns.UInt32(copy_aligned(order, np.uint32)) if len(order) else dr.zeros(ns.UInt32, 1)
+            self.rows = self._make_rows()
         first = windows[0]
         self._axes = [ns.Array3f(*map(float, axis)) for axis in first.axes]
         self._lower = [ns.Float(float(v)) for v in first.lower]
@@ -132,18 +141,23 @@ class SplatLists(SplatHits):
         m = ns.Array3f(*(dr.gather(ns.Float, self.arrays.shapes, i + 9 + k) for k in range(3))) - self.center
         return index[np.argsort(dr.squared_norm(m).numpy(), kind="stable")]
 
-    def _make_rows(self, index: UInt32) -> tuple[Float, UInt32]:
-        """Numbers of the Gaussians ``index``, `ROW_SIZE` each."""
-        ns, a = self._ns, self.arrays
-        if dr.width(index) == 0:
-            return dr.zeros(ns.Float, ROW_SIZE), dr.zeros(ns.UInt32, 1)
+    def _make_rows(self) -> Float:
+        """Numbers of the Gaussians that any cell shows, `ROW_SIZE` each, by rank."""
+        ns, a, index = self._ns, self.arrays, self._indices
         g = [dr.gather(ns.Float, a.shapes, index * SHAPE_SIZE + i) for i in range(13)]
         m = ns.Array3f(*g[9:12]) - self.center
         from_center = [-(g[i] * m.x + g[i + 1] * m.y + g[i + 2] * m.z) for i in (0, 3, 6)]
-        color = a.color(index, m * dr.rsqrt(dr.maximum(dr.squared_norm(m), 1e-30)), ns.Bool(True))
+        seen = ns.Array3f(*g[9:12]) - self.viewpoint
+        color = a.color(index, seen * dr.rsqrt(dr.maximum(dr.squared_norm(seen), 1e-30)), ns.Bool(True))
         rows: Any = dr.ravel(ns.ArrayXf([*g[:9], *from_center, g[12], *color]))
         dr.eval(rows)
-        return rows, index
+        return rows
+
+    def attach(self) -> SplatLists:
+        """These lists with rows that carry the derivatives of the Gaussians, and of the viewpoint through colours."""
+        lists = copy(self)
+        lists.rows = self._make_rows()
+        return lists
 
     # ---- Rays ----
 
@@ -167,74 +181,105 @@ class SplatLists(SplatHits):
         number = (face * nv + cell[1]) * nu + cell[0]
         return dr.gather(ns.UInt32, self._starts, number), dr.gather(ns.UInt32, self._starts, number + 1)
 
+    def distance_to(self, ray: LocalRay) -> Float:
+        """Distance along ``ray`` from the viewpoint, through which its line passes, to its origin."""
+        return dr.norm(ray.o - self.center) * dr.rsqrt(dr.squared_norm(ray.d))
+
+    def evaluate(self, rank: UInt32, d: Vector3f, shift: Vector3f | None, active: Bool) -> tuple[Float, Float, Float]:
+        """`SplatArrays.find_peak` of the Gaussian ``rank`` on the ray from the viewpoint, moved by ``shift``, in the
+        direction ``d``."""
+        at = lambda i: dr.gather(self._ns.Float, self.rows, rank * ROW_SIZE + i, active)
+        matrix = [at(i) for i in range(9)]
+        turn = lambda v: [dr.fma(matrix[i], v.x, dr.fma(matrix[i + 1], v.y, matrix[i + 2] * v.z)) for i in (0, 3, 6)]
+        from_center = [at(9), at(10), at(11)]
+        if shift is not None:
+            from_center = [a + b for a, b in zip(from_center, turn(shift))]
+        return find_peak(from_center, turn(d), at(12))
+
+    def color(self, rank: UInt32, shader: ColorShader, active: Bool) -> Color:
+        """Colour of the Gaussian ``rank``."""
+        at = lambda i: dr.gather(self._ns.Float, self.rows, rank * ROW_SIZE + i, active)
+        return shader.array_type(at(13), at(14), at(15))
+
+    def loop_hits(
+        self, ray: LocalRay, t0: Float, t1: Float, start: Any, visit: Callable[..., Any], extra: Any = None
+    ) -> tuple[Any, Any, Float]:
+        """Loop over the hits of ``ray``, whose line passes through the viewpoint in front of its origin, of the march
+        and of its derivatives.
+
+        ``visit(state, hit, extra)`` processes a hit of the lanes on which ``state.active`` is true. It returns the
+        state, on whose ``active`` lanes the march goes on, and ``extra``. Distances are measured from the viewpoint.
+        Returns both at the end, and the number of Gaussians that were evaluated.
+        """
+        ns, Float = self._ns, type(t0)
+        first, last = self._find_list(ray.d)
+
+        def process(walk: _ListWalk, hit: ListHit, waiting: list[ListHit], active: Bool) -> _ListWalk:
+            here = active & (hit.alpha > 0)
+            state, extra = visit(replace(walk.state, active=here), hit, walk.extra)
+            return replace(walk, active=walk.active & (~here | state.active), waiting=waiting, state=state, extra=extra)
+
+        def read(walk: _ListWalk) -> tuple[_ListWalk]:
+            """Read an entry of the list, and process the nearest hit that is known by then."""
+            rank = dr.gather(ns.UInt32, self._entries, walk.entry, walk.active)
+            t, alpha, distance = self.evaluate(rank, ray.d, None, walk.active)
+            hit = walk.active & (t >= t0) & (t < t1) & (alpha >= MIN_ALPHA) & (distance < self.arrays.extent**2)
+            # What is no hit comes first, and absorbs nothing.
+            new = ListHit(dr.select(hit, t, -dr.inf), dr.select(hit, alpha, 0), rank)
+            nearest, waiting = _exchange(walk.waiting, new)
+            return (replace(process(walk, nearest, waiting, hit), entry=walk.entry + 1),)
+
+        def drain(walk: _ListWalk) -> tuple[_ListWalk]:
+            """Process the nearest hit that waits."""
+            end = ListHit(Float(dr.inf), Float(0), ns.UInt32(0))
+            return (process(walk, walk.waiting[0], [*walk.waiting[1:], end], walk.active),)
+
+        waiting = [ListHit(Float(-dr.inf), Float(0), ns.UInt32(0)) for _ in range(NUM_WAITING)]
+        walk = _ListWalk(start.active, first, waiting, start, extra)
+        (walk,) = dr.while_loop((walk,), lambda walk: walk.active & (walk.entry < last), read, label="entries")
+        (walk,) = dr.while_loop((walk,), lambda walk: walk.active & (walk.waiting[0].t < dr.inf), drain, label="last")
+        return walk.state, walk.extra, Float(walk.entry - first)
+
     def march(self, ray: LocalRay, t0: Float, t1: Float, request: MarchRequest) -> MarchResult:
-        """March ``ray``, whose line passes through the viewpoint in front of its origin, as `march_hits` does."""
+        """March ``ray``, whose line passes through the viewpoint in front of its origin, as `march_hits` does, without
+        derivatives."""
         ns, Float = self._ns, type(t0)
         medium, shader, occlusion = request.medium, request.color, request.occlusion
-        goal, end = optical_depth_limits(Float, request.settings, request.until)
-        goal_light, stop = dr.exp(-goal), dr.exp(-end)
-        # Distances of peaks are measured from the viewpoint.
-        offset = dr.norm(ray.o - self.center) * dr.rsqrt(dr.squared_norm(ray.d))
+        goal, stop = light_limits(Float, request)
+        offset = self.distance_to(ray)
         t0, t1 = t0 + offset, t1 + offset
-        entry, last = self._find_list(ray.d)
 
-        def evaluate(rank: UInt32, active: Bool) -> tuple[Float, Float, Bool]:
-            """``(t, alpha, hit)`` of the Gaussian ``rank``; t from the viewpoint."""
-            at = lambda i: dr.gather(Float, self._rows, rank * ROW_SIZE + i, active)
-            along = [dr.fma(at(i), ray.d.x, dr.fma(at(i + 1), ray.d.y, at(i + 2) * ray.d.z)) for i in (0, 3, 6)]
-            t, alpha, distance = find_peak([at(9), at(10), at(11)], along, at(12))
-            return t, alpha, active & (t >= t0) & (t < t1) & (alpha >= MIN_ALPHA) & (distance < self.arrays.extent**2)
-
-        def blend(ray_state: _Blend, nearest: _Hit, active: Bool) -> tuple[_Blend, Bool]:
-            """Absorb light in the hit ``nearest``; also whether the ray goes on."""
-            state, t = replace(ray_state), nearest.t
-            active = active & (nearest.alpha > 0)
-            weight = dr.select(active, state.light * nearest.alpha, 0)
-            light = state.light - weight
-            crosses = active & (state.light > goal_light) & (light <= goal_light)
-            state.median = dr.select(crosses, t, state.median)
-            state.light_before = dr.select(crosses, state.light, state.light_before)
-            state.light, state.moment = light, dr.fma(weight, dr.select(active, t - t0, 0), state.moment)
+        def visit(state: _Blend, hit: ListHit, _: None) -> tuple[_Blend, None]:
+            active = state.active
+            after, weight, crosses = state.absorb(hit, t0, goal, stop)
+            after.median = dr.select(crosses, hit.t, state.median)
+            after.light_before = dr.select(crosses, state.light, state.light_before)
             if isinstance(shader, ColorShader):
-                at = lambda i: dr.gather(Float, self._rows, nearest.rank * ROW_SIZE + i, active)
-                state.color = state.color + weight * shader.array_type(at(13), at(14), at(15))
+                after.color = state.color + weight * self.color(hit.rank, shader, active)
             elif shader is not None:
-                index = dr.gather(ns.UInt32, self._indices, nearest.rank, active)
-                color = shader.shade(medium, [cast("Float", index)], ray.o + ray.d * (t - offset), ray.w, active)
-                state.color = state.color + weight * color
+                index = dr.gather(ns.UInt32, self._indices, hit.rank, active)
+                p = ray.o + ray.d * (hit.t - offset)
+                after.color = state.color + weight * shader.shade(medium, [cast("Float", index)], p, ray.w, active)
             if state.color_evals is not None:
-                state.color_evals = state.color_evals + dr.select(active, 1, 0)
-            goes_on = light > stop
+                after.color_evals = state.color_evals + dr.select(active, 1, 0)
             if occlusion is not None and state.decided is not None:
                 # Not whether the ray is clear: a nearer Gaussian can follow in the list.
-                is_hidden = active & occlusion.is_hidden(t - offset, -dr.log(light))
-                state.decided, goes_on = state.decided | is_hidden, goes_on & ~is_hidden
-            return state, goes_on
-
-        def body(walk: _ListWalk) -> tuple[_ListWalk]:
-            rank = dr.gather(ns.UInt32, self._entries, walk.entry, walk.active)
-            t, alpha, hit = evaluate(rank, walk.active)
-            # What is no hit comes first, and absorbs nothing.
-            new = _Hit(dr.select(hit, t, -dr.inf), dr.select(hit, alpha, 0), rank)
-            nearest, waiting = _exchange(walk.waiting, new)
-            blended, goes_on = blend(walk.blended, nearest, hit)
-            if blended.density_evals is not None:
-                blended.density_evals = blended.density_evals + dr.select(walk.active, 1, 0)
-            entry = walk.entry + 1
-            return (_ListWalk(walk.active & goes_on & (entry < last), entry, waiting, blended),)
+                is_hidden = active & occlusion.is_hidden(hit.t - offset, -dr.log(after.light))
+                after.decided, after.active = state.decided | is_hidden, after.active & ~is_hidden
+            return after, None
 
         zero = request.init_result(Float)
-        none = _Hit(Float(-dr.inf), Float(0), ns.UInt32(0))
-        counts = zero.decided, zero.density_evals, zero.color_evals
-        blended = _Blend(Float(1), Float(0), Float(dr.inf), Float(1), zero.color, *counts)
-        start = _ListWalk(request.active & (entry < last), entry, [none] * NUM_WAITING, blended)
-        (walk,) = dr.while_loop((start,), lambda walk: walk.active, body, label="entries")
-        blended, goes_on = walk.blended, request.active & (walk.blended.light > stop)
-        if blended.decided is not None:
-            goes_on &= ~blended.decided
-        for hit in walk.waiting:
-            blended, ends = blend(blended, hit, goes_on)
-            goes_on &= ends
+        start = _Blend(
+            active=request.active,
+            light=Float(1),
+            moment=Float(0),
+            color=zero.color,
+            median=Float(dr.inf),
+            light_before=Float(1),
+            decided=zero.decided,
+            color_evals=zero.color_evals,
+        )
+        blended, _, evaluations = self.loop_hits(ray, t0, t1, start, visit)
         is_crossed = dr.isfinite(blended.median)
         distance = dr.select(is_crossed, blended.median - offset, dr.inf)
         return replace(
@@ -246,9 +291,15 @@ class SplatLists(SplatHits):
             crossing_start_tau=dr.select(is_crossed, -dr.log(blended.light_before), 0),
             color=blended.color,
             decided=blended.decided,
-            density_evals=blended.density_evals,
+            density_evals=evaluations if request.count else None,
             color_evals=blended.color_evals,
         )
+
+
+def light_limits(Float: type, request: MarchRequest) -> tuple[Float, Float]:
+    """Transmittances ``(goal, stop)``: the crossing that is searched for, and the end of the march."""
+    goal, end = optical_depth_limits(Float, request.settings, request.until)
+    return dr.exp(-goal), dr.exp(-end)
 
 
 class _Extent(NamedTuple):
@@ -319,7 +370,7 @@ def _list_members(bounds: _Rectangles, order: np.ndarray, cells: tuple[int, int]
 
 
 @dataclass
-class _Hit:
+class ListHit:
     """A Gaussian on a ray: distance from the viewpoint, absorbed fraction (0: none) and rank."""
 
     t: Float
@@ -327,19 +378,37 @@ class _Hit:
     rank: UInt32
 
 
-@dataclass
-class _Blend:
-    """Sums along a ray. Distances are measured from the viewpoint."""
+@dataclass(kw_only=True)
+class ListSums:
+    """Sums over the hits of a ray."""
 
+    active: Bool
     # Light that is not absorbed yet.
     light: Float
+    # Sum of the absorption distances, measured from the start of the march.
     moment: Float
+    color: Any
+
+    def absorb(self, hit: ListHit, t0: Float, goal: Float, stop: Float) -> tuple[Self, Float, Bool]:
+        """Absorb light in ``hit`` and return ``(sums, weight, crosses)`` like `MarchSums.absorb`.
+
+        ``t0``: start of the march; ``goal``, ``stop``: see `light_limits`.
+        """
+        active, weight = self.active, dr.select(self.active, self.light * hit.alpha, 0)
+        light, distance = self.light - weight, dr.select(active, hit.t - t0, 0)
+        moment = dr.fma(weight, distance, self.moment)
+        after = replace(self, active=active & (light > stop), light=light, moment=moment)
+        return after, weight, active & (self.light > goal) & (light <= goal)
+
+
+@dataclass(kw_only=True)
+class _Blend(ListSums):
+    """Loop state of `SplatLists.march`."""
+
     # Distance at which the light falls below the goal, and the light in front of it.
     median: Float
     light_before: Float
-    color: Any
     decided: Bool | None
-    density_evals: Float | None
     color_evals: Float | None
 
 
@@ -350,16 +419,17 @@ class _ListWalk:
     active: Bool
     entry: UInt32
     # Hits that wait for nearer ones in the rest of the list, nearest first.
-    waiting: list[_Hit]
-    blended: _Blend
+    waiting: list[ListHit]
+    state: Any
+    extra: Any
 
 
-def _exchange(waiting: list[_Hit], new: _Hit) -> tuple[_Hit, list[_Hit]]:
+def _exchange(waiting: list[ListHit], new: ListHit) -> tuple[ListHit, list[ListHit]]:
     """Insert ``new`` into the sorted hits ``waiting``; return the nearest of all, and the others."""
 
-    def order(a: _Hit, b: _Hit) -> tuple[_Hit, _Hit]:
+    def order(a: ListHit, b: ListHit) -> tuple[ListHit, ListHit]:
         swap = b.t < a.t
-        pick = lambda x, y: _Hit(*(dr.select(swap, v, w) for v, w in zip(vars(x).values(), vars(y).values())))
+        pick = lambda x, y: ListHit(*(dr.select(swap, v, w) for v, w in zip(vars(x).values(), vars(y).values())))
         return pick(b, a), pick(a, b)
 
     if not waiting:
@@ -388,13 +458,14 @@ def cells_of_observer(count: int) -> int:
     return int(np.clip(round(np.sqrt(count) / 8), 16, 128))
 
 
-def list_splats(medium: SplatMedium, center: np.ndarray, rays: int, windows: tuple[Window, ...] = ()) -> SplatMedium:
+def list_splats(medium: SplatMedium, center: Point3f, rays: int, windows: tuple[Window, ...] = ()) -> SplatMedium:
     """The ``medium`` for ``rays`` rays from ``center``, with lists where they take less time than the tree.
 
     Parameters
     ----------
-    center : array (3,)
-        Viewpoint in the frame of the Gaussians. The line of each ray passes through it, in front of the ray's origin.
+    center : Point3f
+        Viewpoint in the frame of the Gaussians, one lane. The line of each ray passes through it, in front of the ray's
+        origin.
     windows : tuple of Window
         Directions of the rays, in that frame; default: all.
     """
@@ -402,15 +473,20 @@ def list_splats(medium: SplatMedium, center: np.ndarray, rays: int, windows: tup
     if not medium.may_list or arrays.count < MIN_GAUSSIANS or rays < MIN_RAYS_PER_GAUSSIAN * arrays.count:
         return medium
     windows = windows or cube_windows(cells_of_observer(arrays.count))
-    key = (tuple(map(float, center)), tuple((w.axes.tobytes(), w.lower, w.upper, w.cells) for w in windows))
-    made_of = Fingerprint([arrays.shapes, arrays.colors])
-    earlier, lists = medium.lists.pop(key, (None, None))
-    if lists is None or earlier != made_of:
-        lists = SplatLists(arrays, center, windows)
+    position = np.array(dr.detach(center), np.float64).ravel()
+    key = (tuple(map(float, position)), tuple((w.axes.tobytes(), w.lower, w.upper, w.cells) for w in windows))
+    made_of = Fingerprint(dr.detach([arrays.shapes, arrays.colors]))
+    # Lists of other Gaussians, as before a step of an optimisation, are of no use any more.
+    for other in [k for k, (earlier, _) in medium.lists.items() if earlier != made_of]:
+        del medium.lists[other]
+    _, lists = medium.lists.pop(key, (None, None))
+    if lists is None:
+        lists = SplatLists(arrays, position, windows)
         # The lists of a camera and of an observer are kept in any case.
         while len(medium.lists) > 1 and sum(other.size for _, other in medium.lists.values()) > _MAX_NUMBERS:
             del medium.lists[next(iter(medium.lists))]
     medium.lists[key] = made_of, lists
     seen = copy(medium)
-    seen.hits = lists
+    seen.hits = copy(lists)
+    seen.hits.viewpoint = arrays.namespace.Array3f(center)
     return seen
