@@ -6,7 +6,7 @@ Needs ``pip install ETDQualitizer pymovements eyedentify3d``. One participant ea
 EyeNavGS scenes (71 Hz):
 
 - Data quality: those of `nerg_mi.tracking.quality.measure_recordings`, and ETDQualitizer's for the same angles.
-- Fixations by velocity: the samples of `nerg_mi.tracking.events.detect_fixations_ivt`, and of pymovements' I-VT for the
+- Fixations by velocity: the samples of `nerg_mi.tracking.events.label_fixations`, and of pymovements' I-VT for the
   same velocities. There a sample has the velocity of the step before it, so that an event begins one sample later: its
   minimum duration is set one interval shorter.
 - Events: those of `nerg_mi.tracking.events.detect_events`, and EyeDentify3D's. Cohen's kappa over samples, and the
@@ -20,7 +20,8 @@ import argparse
 import os
 from pathlib import Path
 
-from nerg_mi.tracking.events import Events, angles_about, detect_events, detect_fixations_ivt, measure_velocities
+from nerg_mi.tracking.event_settings import EventRules
+from nerg_mi.tracking.events import Events, angles_about, detect_events, label_fixations, measure_velocities
 from nerg_mi.tracking.quality import measure_recordings
 from nerg_mi.tracking.rays import Rays
 from nerg_mi.tracking.readers.registry import read_rays
@@ -85,7 +86,9 @@ def compare_velocity_threshold(name: str, rays: Rays) -> dict:
     from pymovements.events import ivt
 
     v = measure_velocities(rays)
-    ours = detect_fixations_ivt(rays, velocity=100.0, min_duration=0.06, gap=10.0)
+    # By velocity alone.
+    rules = EventRules(velocity_threshold=100.0, min_fixation=0.06, max_step=10.0, merge_gap=0.0, pursuit_velocity=1e6)
+    ours, _ = label_fixations(rays, rules)
     velocity = np.r_[v.gaze[:1], v.gaze]
     t = np.rint(1000 * rays.t).astype(int)
     shortest = round(60 - 1000 * float(np.median(np.diff(rays.t))))

@@ -32,7 +32,8 @@ from nerg_mi.tasks.parts import PartRunner
 from nerg_mi.tasks.settings import Parallel
 from nerg_mi.tasks.task import Part
 from nerg_mi.tracking.dataset import open_rays, open_recordings
-from nerg_mi.tracking.events import detect_fixations_ivt, warn_unknown_tracking
+from nerg_mi.tracking.event_settings import EventRules, read_fixations
+from nerg_mi.tracking.events import label_fixations, warn_unknown_tracking
 from nerg_mi.tracking.rays import TRACKING, Rays
 from nerg_mi.transport.observer_gaze import GazeFieldInstance
 
@@ -97,6 +98,10 @@ def draw_choices(choices: Choices, names: Container[str], num_fields: int, rng: 
     return choice | ({"field": int(rng.integers(num_fields)) + 1} if num_fields else {})
 
 
+def _make_rules(choice: Mapping[str, Any]) -> EventRules:
+    return EventRules(velocity_threshold=choice["velocity"], min_fixation=choice["min_fixation"])
+
+
 def find_motion(choice: Mapping[str, Any], center: np.ndarray, scale: float) -> np.ndarray:
     """Return the motion (4, 4) of the tracking in the scene: a rotation about ``center`` and a shift."""
     cos, sin = np.cos(np.radians(choice["rotation"])), np.sin(np.radians(choice["rotation"]))
@@ -158,7 +163,7 @@ class Analyses:
         """Sum the visits with these choices."""
         rays = self.rays
         if choice["samples"] == "fixations":
-            rays = rays.select(detect_fixations_ivt(rays, choice["velocity"], choice["min_fixation"]) >= 0)
+            rays = rays.select(label_fixations(rays, _make_rules(choice))[0] >= 0)
         rules = replace(self.counting.rules, **{k: choice[k] for k in ("min_visit", "merge_gap", "max_gap")})
         counting = replace(self.counting, rules=rules)
         if choice["tracker"] == "ignored":
@@ -490,6 +495,7 @@ def robustness(
         for note in placed.warnings:
             reporter.message(note)
         choices = _adapt_choices(choices, base, align, reporter)
+        changed |= _describe_fixations(base, choices)
         reference, num_fields = base.get_reference(), len(base.networks) - 1 if isinstance(base, Predictions) else 0
         rngs = [np.random.default_rng((seed, k)) for k in range(analyses)]
         drawn = [draw_choices(choices, reference.keys(), num_fields, rng) for rng in rngs]
@@ -575,7 +581,8 @@ def _adapt_to_rays(choices: Choices, base: Analyses, reporter: Reporter) -> Choi
         reason = f"the rays are {TRACKING[rays.tracking]}"
     else:
         warn_unknown_tracking(rays.tracking, reporter.warn)
-        label = detect_fixations_ivt(rays, choices.velocity[0], max(choices.min_fixation))
+        strictest = {"velocity": choices.velocity[0], "min_fixation": choices.min_fixation[1]}
+        label, _ = label_fixations(rays, _make_rules(strictest))
         missing = len(rays.participants) - len(np.unique(rays.person[label >= 0]))
         if missing:
             reason = f"{missing:,} participants have no fixation below {choices.velocity[0]:g} degrees per second"
@@ -585,6 +592,14 @@ def _adapt_to_rays(choices: Choices, base: Analyses, reporter: Reporter) -> Choi
         raise NergError(f"fixations cannot be selected, because {reason}; add all to the samples of the choices")
     reporter.message(f"all samples count in each analysis, because {reason}")
     return replace(choices, samples=("all",))
+
+
+def _describe_fixations(base: Analyses | Predictions, choices: Choices) -> dict[str, Any]:
+    """Return the definitions of the fixations that the rays were reduced to, and of those that are drawn."""
+    if isinstance(base, Predictions):
+        return {}
+    drawn = EventRules().describe() | {"velocity": choices.velocity, "min_fixation": choices.min_fixation}
+    return read_fixations(base.rays.metadata) | ({"drawn_fixations": drawn} if "fixations" in choices.samples else {})
 
 
 def _read_uncertainty(align: Any) -> tuple[float, float]:

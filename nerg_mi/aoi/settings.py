@@ -122,8 +122,8 @@ class Choices(ValidatedDataclass):
     weighting: tuple[str, ...] = ("participants", "time")
     """Weights of participants in shares: the same for each, or the recorded time."""
     samples: tuple[str, ...] = ("all", "fixations")
-    """Samples that count: all, or those of fixations (I-VT). The time between fixations then belongs to the earlier
-    one, up to ``max_gap``."""
+    """Samples that count: all, or those of fixations (as in nerg rays events). The time between fixations then belongs
+    to the earlier one, up to ``max_gap``."""
     velocity: tuple[float, float] = range_field((20.0, 100.0), Range(0.1, 10**6))
     """Velocity in degrees per second above which a fixation ends."""
     min_fixation: tuple[float, float] = range_field((0.06, 0.15), SECONDS)

@@ -27,6 +27,7 @@ from nerg_mi.ranges import SEEDS, TIMES, Range, check_ranges
 from nerg_mi.tasks.parts import PartRunner
 from nerg_mi.tasks.settings import Parallel
 from nerg_mi.tracking.dataset import RayDataset, open_recordings
+from nerg_mi.tracking.event_settings import read_fixations
 from nerg_mi.tracking.objects import ObjectPoses
 from nerg_mi.tracking.pseudonyms import make_pseudonyms, read_salt
 from nerg_mi.tracking.rays import TRACKING, Rays
@@ -232,6 +233,7 @@ def statistics(
             # Errors in changes are reported before anything is counted.
             changes = None if what_if is None else open_changes(what_if)
             files += [] if changes is None else changes.meshes
+            changed |= {} if work.rays is None else read_fixations(work.rays.metadata)
             attention = work.measure(viewpoints, eyes, grid)
             result = work.make_tables(attention, power, show_names, salt)
             if changes is not None and attention.predicted is not None:

@@ -117,7 +117,8 @@ TABLE = (
         _RAYS_OUTPUT,
         computes=False,
         spellings={"persons": ("--person",), "without_persons": ("--without-person",), "cohorts": ("--cohort",)},
-        without=("thin_distance", "with_hit", "seed"),
+        without=("thin_distance", "with_hit", "seed", "head_velocity", "pursuit_velocity", "pursuit_angle", "merge_gap")
+        + ("max_blink", "eye_velocity", "max_step"),
     ),
     Row(
         "rays split",

@@ -23,6 +23,7 @@ from nerg_mi.files.values import FilePath, to_path
 from nerg_mi.progress import Progress, Reporter, open_reporter
 from nerg_mi.ranges import DIRECTIONS, KAPPAS, SEEDS, Range, check_ranges
 from nerg_mi.tracking.dataset import hash_rays, open_rays
+from nerg_mi.tracking.event_settings import read_fixations
 from nerg_mi.tracking.filters import purge, split_by_person
 from nerg_mi.tracking.rays import TRACKING, Rays
 from nerg_mi.tracking_kinds import read_tracking
@@ -91,6 +92,8 @@ class GazeEvaluation(ResultTables):
     draw: Callable[[Path], None] | None = field(default=None, compare=False)
     # Bits of the field and of baselines where training participants stood, and where none did (`score_kinds`).
     verdicts: list[dict[str, Any]] = field(default_factory=list)
+    # Definition of the fixations that the rays were reduced to (`read_fixations`).
+    fixations: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def verdict(self) -> str:
@@ -110,6 +113,7 @@ class GazeEvaluation(ResultTables):
             "gaze": self.gaze,
             **({} if self.gaze_sha256 is None else {"gaze_sha256": self.gaze_sha256}),
             "tracking": self.tracking,
+            **self.fixations,
             "split": self.split,
             "kappa": self.kappa,
             "positions": self.positions,
@@ -272,7 +276,8 @@ def evaluate_gaze(
 
         def draw(path: Path) -> None:
             sources = existing_files(loaded.path, rays, opened.path)
-            record = make_provenance("nerg eval gaze", sources, seed, changed_arguments(evaluate_gaze, arguments))
+            settings = changed_arguments(evaluate_gaze, arguments) | read_fixations(data.metadata)
+            record = make_provenance("nerg eval gaze", sources, seed, settings)
             draw_comparison(test, select(_DRAWN), path, pictures, provenance=record)
 
         result = GazeEvaluation(
@@ -294,6 +299,7 @@ def evaluate_gaze(
             f"{notes} Tracking: {TRACKING[tracking]}. {format_settings(baselines)}",
             draw if pictures else None,
             verdicts,
+            read_fixations(data.metadata),
         )
         if folder is not None:
             reporter.progress(0.95, "pictures")

@@ -215,6 +215,7 @@ def draw_scanpath(
         names = tuple(data.persons[p] for p in people)
         axes = scanpath_figure(view.color, pixels, durations[rows], index, names, note=note)
         inputs = [*existing_files(rays), *list_files(opened)]
+        changed |= {"fixations": rules.describe(dispersion_threshold)}
         return finish_figure(axes, output, "nerg draw scanpath", inputs, seed, changed, reporter)
 
 

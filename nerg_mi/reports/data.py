@@ -170,7 +170,10 @@ def anonymize_rays(rays: Rays, labels: ParticipantLabels) -> Rays:
     number = {name: f"file {k + 1}" for k, name in enumerate(dict.fromkeys(files))}
     metadata["dropped"] = [{**d, "file": number[d.get("file")]} for d in rays.metadata.get("dropped", [])]
     step_keys = ("step", "side", "kept", "of")
-    metadata["steps"] = [{k: step[k] for k in step_keys if k in step} for step in rays.metadata.get("steps", [])]
+    metadata["steps"] = [
+        {k: v for k, v in step.items() if k in step_keys or step["step"] == "fixations"}
+        for step in rays.metadata.get("steps", [])
+    ]
     # Sorted by label: the order of names or files could reveal them.
     order = sorted(range(len(rays.persons)), key=lambda i: labels.number(rays.persons[i]))
     code = np.empty(len(order), np.int32)

@@ -34,7 +34,8 @@ from nerg_mi.tasks.execution import prepare_once
 from nerg_mi.tasks.parts import PartRunner
 from nerg_mi.tasks.settings import Parallel
 from nerg_mi.tasks.task import RENDER_LIBRARIES, Part, Plan
-from nerg_mi.tracking.dataset import open_rays
+from nerg_mi.tracking.dataset import open_rays, open_recordings
+from nerg_mi.tracking.event_settings import read_fixations
 from nerg_mi.tracking.rays import Rays
 from nerg_mi.tracking.readers.columns import open_named_table
 from nerg_mi.transport.extrapolation import warn_extrapolation
@@ -123,7 +124,8 @@ class BakeInputs:
     def describe_origin(self, changed: Mapping[str, Any]) -> tuple[Provenance, dict[str, Any]]:
         """Return the provenance of the bake, with ``changed`` settings, and the same as JSON for the summary."""
         paths = [getattr(x, "path", x) for x in (self.surface, self.gaze, self.rays, self.observer_file, self.align)]
-        record = make_provenance("nerg bake", existing_files(*paths), self.seed, changed)
+        reduced = {} if self.rays is None else read_fixations(open_recordings(self.rays).metadata)
+        record = make_provenance("nerg bake", existing_files(*paths), self.seed, {**changed, **reduced})
         summary = {"what": record.what, "inputs": dict(record.inputs), "seed": record.seed}
         return record, {**summary, "settings": dict(record.settings), "versions": dict(record.versions)}
 

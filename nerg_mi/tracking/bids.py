@@ -24,6 +24,7 @@ from nerg_mi.errors import NergError, parameter, sanitize
 from nerg_mi.files.atomic import create_folder_atomically, write_bytes, write_text
 from nerg_mi.files.tables import write_json
 
+from .event_settings import read_fixations
 from .filters import estimate_interval, find_sessions
 from .rays import TRACKING, Rays
 from .readers.bids import (
@@ -300,6 +301,7 @@ def _describe_gaze(rays: Rays, task: str, columns: Iterable[str]) -> dict[str, A
         "PhysioType": "eyetrack",
         "RecordedEye": _EYES.get(str(rays.metadata.get("eye")), "cyclopean"),
         TRACKING_KEY: rays.tracking,
+        **{name.capitalize(): definition for name, definition in read_fixations(rays.metadata).items()},
         "SampleCoordinateSystem": CUSTOM,
         "SampleCoordinateSystemDescription": _SYSTEM.format(units=frame["units"]),
         WORLD: world,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, ClassVar
 
@@ -79,3 +80,11 @@ class EventRules(ValidatedDataclass):
             "velocity": limits.pop("velocity_threshold"),
             **limits,
         }
+
+
+def read_fixations(metadata: Mapping[str, Any]) -> dict[str, Any]:
+    """Return ``{"fixations": definition}`` for the ``metadata`` of rays that were reduced to fixations, which outputs
+    record with their settings; empty for those of all samples."""
+    steps = [step for step in metadata.get("steps", []) if step["step"] == "fixations"]
+    counts = ("step", "kept", "of")
+    return {"fixations": {k: v for k, v in steps[-1].items() if k not in counts}} if steps else {}

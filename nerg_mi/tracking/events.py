@@ -17,44 +17,19 @@ from .rays import TRACKING, Rays
 
 # ---- Fixations ----
 #
-# I-VT and I-DT of Salvucci and Goldberg (2000), on directions in the world frame.
-#
-# Angles are in degrees, times in seconds. A pause of a participant longer than ``gap`` ends a fixation. Both functions
-# return the number of the fixation of each ray, or -1; numbers increase by participant and time.
-
-
-MIN_FIXATION_IVT, MIN_FIXATION_IDT = 0.06, 0.1  # default minimum durations in seconds
-
-
-def detect_fixations_ivt(
-    rays: Rays, velocity: float = 100.0, min_duration: float = MIN_FIXATION_IVT, gap: float = MAX_STEP
-) -> np.ndarray:
-    """Detect fixations by velocity (I-VT): runs of rays that turn at most by ``velocity`` degrees per second and last
-    at least ``min_duration`` seconds.
-
-    The velocity of a ray is measured from the previous ray; that of the first ray of a run, to the next one. The
-    default of 100 degrees per second suits gaze in the world frame of people who walk and turn; 30 is common for a
-    stationary head. Returns (N,) int64.
-    """
-    require_gaze(rays)
-    _require_positive(velocity=velocity, min_duration=min_duration, gap=gap)
-    order, step, gaze = _measure_steps(rays)
-    with np.errstate(invalid="ignore"):
-        runs = _select_long(_find_runs((step > 0) & (step <= gap) & ~(gaze > velocity)), rays.t[order], min_duration)
-    run, sample = expand_runs(runs, 1)
-    label = np.full(len(rays), -1, np.int64)
-    label[order[sample]] = run
-    return label
+# `label_fixations` is their one definition: events by velocities of gaze and head, which extend I-VT, or I-DT of
+# Salvucci and Goldberg (2000), on directions in the world frame. Angles are in degrees, times in seconds.
 
 
 def detect_fixations_idt(
-    rays: Rays, dispersion: float = 3.0, min_duration: float = MIN_FIXATION_IDT, gap: float = MAX_STEP
+    rays: Rays, dispersion: float = 3.0, min_duration: float = 0.1, gap: float = MAX_STEP
 ) -> np.ndarray:
     """Detect fixations by dispersion (I-DT): a window of ``min_duration`` seconds with a dispersion of at most
     ``dispersion`` degrees grows as long as this holds; otherwise the window starts one ray later.
 
     Dispersion is the horizontal plus the vertical range (max - min) of the directions, in the tangent plane of the
-    sphere at the window's first direction (azimuthal equidistant projection, horizontal and vertical axes). Returns
+    sphere at the window's first direction (azimuthal equidistant projection, horizontal and vertical axes). A pause
+    longer than ``gap`` ends a fixation. Returns the number of the fixation of each ray, by participant and time, or -1,
     (N,) int64.
     """
     require_gaze(rays)

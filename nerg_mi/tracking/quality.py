@@ -19,7 +19,7 @@ from nerg_mi.progress import Progress, open_reporter
 from .checks import RECORDING_CHECKS, RayStatistics
 from .dataset import RayDataset, open_recordings
 from .direction_checks import DIRECTION_CHECKS
-from .event_settings import FIXATIONS
+from .event_settings import FIXATIONS, read_fixations
 from .events import Events, angles_about, detect_events, expand_runs
 from .filters import argsort_by_person_time, estimate_interval, find_sessions
 from .rays import TRACKING, Rays
@@ -183,7 +183,9 @@ def make_quality_report(rays: Rays, summary: RaysSummary) -> list[tuple[str, str
         lines.append(("unused columns", f"{', '.join(unused[:_MAX_NAMES])}{suffix}"))
     for step in rays.metadata.get("steps", []):
         name = f"{step['step']} {step.get('side', '')}".strip()
-        lines.append(("step", f"{name}: {step['kept']:,} of {step['of']:,} rays kept"))
+        (definition,) = read_fixations({"steps": [step]}).values() or ({},)
+        text = "".join(f", {key} {value}" for key, value in definition.items())
+        lines.append(("step", f"{name}: {step['kept']:,} of {step['of']:,} rays kept{text}"))
     source = rays.metadata.get("source_frame")
     if source:
         lines.append(("source frame", f"{source['up']} up, {source['handedness']}-handed, {source['units']}"))

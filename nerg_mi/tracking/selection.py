@@ -26,6 +26,7 @@ from .dataset import (
     write_dataset_manifest,
 )
 from .dataset_write import SourceWriter
+from .event_settings import EventRules
 from .rays import SUFFIXES, Rays, merge_rays
 
 
@@ -42,15 +43,14 @@ def filter_rays(
     min_confidence: Annotated[float, Range(0, 1)] | None = None,
     with_hit: bool = False,
     fixations: Literal["ivt", "idt"] | None = None,
-    velocity_threshold: Annotated[float, Range(0, 10**6)] = 100.0,
     dispersion_threshold: Annotated[float, Range(0, 180)] = 3.0,
-    min_fixation: Annotated[float, SECONDS] | None = None,
     merge_fixations: bool = False,
     thin: Annotated[float, SECONDS] | None = None,
     thin_distance: Annotated[float, Range(0, 10**6)] = 0.1,
     sample: Annotated[int, RAYS] | None = None,
     seed: Annotated[int, SEEDS] = 0,
     output: FilePath | None = None,
+    rules: EventRules = EventRules(),
     progress: Progress = None,
 ) -> Rays | RayDataset:
     """Select rays by conditions, detect fixations, and thin out stationary periods.
@@ -76,13 +76,9 @@ def filter_rays(
     with_hit : bool
         Select only rays with a hit point.
     fixations : str, optional
-        Select only rays of fixations, detected by ivt (velocity threshold) or idt (dispersion threshold).
-    velocity_threshold : float
-        Angular velocity in degrees per second above which a fixation ends (ivt).
+        Select only rays of fixations, detected by ivt (velocities, as in nerg rays events) or idt (dispersion).
     dispersion_threshold : float
         Angular dispersion in degrees within which a fixation stays (idt).
-    min_fixation : float, optional
-        Minimum duration of a fixation in seconds. Default: 0.06 for ivt, 0.1 for idt.
     merge_fixations : bool
         Replace the rays of each fixation by their mean ray.
     thin : float, optional
@@ -96,6 +92,8 @@ def filter_rays(
         Seed of ``sample``.
     output : path, optional
         Rays file to write (.npz or .parquet); for a dataset, another dataset (.rays).
+    rules : EventRules
+        Limits between the kinds of events (`nerg_mi.tracking.event_settings.EventRules`).
     progress : bool, Reporter or None
         Progress and messages (`nerg_mi.progress.Progress`).
 
@@ -128,10 +126,8 @@ def filter_rays(
     selection = _Selection(
         {name: value for name, value in conditions.items() if value is not None},
         fixations,
-        {"velocity": velocity_threshold} if fixations == "ivt" else {"dispersion": dispersion_threshold},
-        (events.MIN_FIXATION_IVT if fixations == "ivt" else events.MIN_FIXATION_IDT)
-        if min_fixation is None
-        else min_fixation,
+        rules,
+        dispersion_threshold if fixations == "idt" else None,
         merge_fixations,
         thin,
         thin_distance,
@@ -166,8 +162,8 @@ class _Selection:
 
     conditions: dict[str, Any]  # keywords of `Conditions`
     fixations: str | None
-    threshold: dict[str, float]
-    min_fixation: float
+    rules: EventRules
+    dispersion: float | None
     merge_fixations: bool
     thin: float | None
     thin_distance: float
@@ -230,15 +226,13 @@ class _Steps:
             self.select_mask(mask, "thin", settings)
 
     def _select_fixations(self, selection: _Selection) -> None:
-        detect = events.detect_fixations_ivt if selection.fixations == "ivt" else events.detect_fixations_idt
-        label = np.zeros(0, np.int64)
+        rules, dispersion, label = selection.rules, selection.dispersion, np.zeros(0, np.int64)
         if len(self.rays):
-            label = detect(self.rays, **selection.threshold, min_duration=selection.min_fixation)
+            label = events.label_fixations(self.rays, rules, dispersion)[0]
         self.fixations = len(np.unique(label[label >= 0]))
         if self._reporter is not None:
             self._reporter.message(f"{self.fixations:,} fixations ({selection.fixations})")
-        # The keys of the metadata.
-        settings = {"by": selection.fixations, **selection.threshold, "least": selection.min_fixation}
+        settings = {"by": selection.fixations, **rules.describe(dispersion)}
         if not selection.merge_fixations:
             self.select_mask(label >= 0, "fixations", settings)
             return

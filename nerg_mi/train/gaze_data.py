@@ -20,6 +20,7 @@ from nerg_mi.maths.geometry import AnyBox, intersect_box_numpy
 from nerg_mi.maths.sphere import fibonacci_directions, sort_directions
 from nerg_mi.maths.types import variant_types
 from nerg_mi.photos.salience import SalienceView
+from nerg_mi.tracking.event_settings import read_fixations
 from nerg_mi.tracking.probes import Probes, place_probes
 from nerg_mi.tracking.rays import Rays
 from nerg_mi.transport.field_medium import FieldMedium, features_for_observer
@@ -115,14 +116,15 @@ class Supervision:
             "views": _hash_arrays(views) if views else None,
         }
 
-    def summarize_data(self) -> dict[str, int | str]:
-        """Return the numbers of ``rays``, participants (``people``) and salience views, and the ``tracking`` of
-        the rays (JSON)."""
+    def summarize_data(self) -> dict[str, Any]:
+        """Return the numbers of ``rays``, participants (``people``) and salience views, and the ``tracking`` and the
+        definition of the ``fixations`` of the rays (JSON)."""
         views = {"salience_views": len(self.views)}
         if self.rays is None:
             return {"rays": 0, "people": 0, **views}
         num_participants = len(np.unique(self.rays.person))
-        return {"rays": len(self.rays), "people": num_participants, **views, "tracking": self.rays.tracking}
+        counts = {"rays": len(self.rays), "people": num_participants, **views}
+        return {**counts, "tracking": self.rays.tracking, **read_fixations(self.rays.metadata)}
 
     def make_support(self, radius: float, geometry: Environment) -> RaySupport | None:
         """Return the local ray count as a function of position in the frame of ``geometry``, for probes of ``radius``

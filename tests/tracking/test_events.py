@@ -16,7 +16,6 @@ from nerg_mi.tracking.events import (
     average_fixations,
     detect_events,
     detect_fixations_idt,
-    detect_fixations_ivt,
     label_fixations,
     measure_velocities,
 )
@@ -31,6 +30,13 @@ def gaze(azimuth, elevation=0.0, dt=0.02, **columns):
     a, e = np.broadcast_arrays(np.radians(np.asarray(azimuth, float)), np.radians(elevation))
     d = np.stack([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)], axis=1)
     return some_rays(len(d), **{"t": np.arange(len(d)) * dt, "direction": d, **columns})
+
+
+def detect_fixations_ivt(rays, velocity=100.0, min_duration=0.06, gap=0.1):
+    """Fixations by velocity alone: I-VT."""
+    only = {"merge_gap": 0.0, "pursuit_velocity": 1e6}
+    rules = EventRules(velocity_threshold=velocity, min_fixation=min_duration, max_step=gap, **only)
+    return label_fixations(rays, rules)[0]
 
 
 # Ten rays at 0 degrees, a saccade of two, ten at 20, one at 40, ten at 60: 50 Hz.
@@ -119,8 +125,8 @@ def test_one_ray_per_fixation():
     assert np.allclose(one.head[0], want / np.linalg.norm(want)) and np.isnan(one.head[1]).all()
     with pytest.raises(NergError, match="no fixation"):
         average_fixations(rays, np.full(20, -1))
-    with pytest.raises(NergError, match="velocity must be positive"):
-        detect_fixations_ivt(rays, velocity=0)
+    with pytest.raises(NergError, match="dispersion must be positive"):
+        detect_fixations_idt(rays, dispersion=0)
 
 
 @pytest.mark.parametrize("find", [detect_fixations_ivt, detect_fixations_idt])
