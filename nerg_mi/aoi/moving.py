@@ -34,6 +34,11 @@ from .placed import (
 )
 from .shares import SamplePoints, find_visible_points
 
+_FIRST_POINTS = (2, 8)
+"""Numbers of points of an AOI after which observers who see one of them are decided."""
+
+_GOLDEN = 0.6180339887498949
+
 # ---- Objects in an environment ----
 
 
@@ -154,24 +159,38 @@ class AreasAtTimes:
     def trace_depth(self, o: np.ndarray, d: np.ndarray) -> np.ndarray:
         """Return the distance (N,) along rays, one for each time, to the surfaces of the environment or, if these are
         unknown, to the nearest AOI."""
-        aois, depth = self.look(o, d)
-        return find_nearest_entry(aois, o, d) if depth is None else depth
+        if self.moving.placed.environment.has_surfaces:
+            return self._trace(o, d).min(axis=0)
+        return find_nearest_entry(self.look(o, d)[0], o, d)
 
     def find_visible(self, observers: np.ndarray, facing: np.ndarray, fov: float) -> np.ndarray:
         """Return whether each elementary AOI is visible to the observers (N, 3), one for each time, (N, K)."""
         moving, out = self.moving, np.zeros((len(observers), len(self.moving.placed.aois)), bool)
-        depth_at = lambda rows, o, d: self.select(rows).trace_depth(o, d)
         for k, targets in enumerate(moving.sample_points):
-            points, normals, is_there = targets.points[None], targets.normals[None], np.ones(len(observers), bool)
-            for item, motion in zip(moving.objects, self.motions):
-                if k in item.elements:
-                    points, is_there = motion.move(targets.points), motion.is_present
-                    normals = targets.normals @ np.swapaxes(motion.rotation, 1, 2)
-            is_visible = find_visible_points(
-                points, normals, observers, depth_at, moving.placed.margin, facing=facing, fov=fov
-            )
-            out[:, k] = is_visible.any(axis=1) & is_there
+            motion = next((m for item, m in zip(moving.objects, self.motions) if k in item.elements), None)
+            rows = np.arange(len(observers)) if motion is None else np.flatnonzero(motion.is_present)
+            # Most AOIs that are visible are so at one of a few points, and the others are not traced then.
+            for part in np.split(_spread(len(targets.points)), _FIRST_POINTS):
+                points, normals = targets.points[part], targets.normals[part]
+                here = self.select(rows)
+                moved = None if motion is None else motion.select(rows)
+                is_visible = find_visible_points(
+                    points[None] if moved is None else moved.move(points),
+                    normals[None] if moved is None else normals @ np.swapaxes(moved.rotation, 1, 2),
+                    observers[rows],
+                    lambda subset, o, d, here=here: here.select(subset).trace_depth(o, d),
+                    moving.placed.margin,
+                    facing=facing[rows],
+                    fov=fov,
+                ).any(axis=1)
+                out[rows[is_visible], k] = True
+                rows = rows[~is_visible]
         return out
+
+
+def _spread(count: int) -> np.ndarray:
+    """Return the indices of ``count`` points in an order in which the first ones are spread over all of them."""
+    return np.argsort(np.arange(count) * _GOLDEN % 1, kind="stable")
 
 
 def place_objects(placed: PlacedAreas, poses: ObjectPoses) -> MovingAreas:
