@@ -10,7 +10,7 @@ from itertools import combinations
 import numpy as np
 
 from nerg_mi.environment.sampler import DirectionQuery
-from nerg_mi.tracking.events import detect_fixations_ivt
+from nerg_mi.tracking.events import label_fixations
 from nerg_mi.tracking.rays import Rays
 
 from .estimates import estimate_ratios
@@ -105,9 +105,9 @@ class Disturbance:
 
 
 def find_first_of_fixation(rays: Rays) -> np.ndarray:
-    """Return the index (N,) of the first sample of the fixation that each sample belongs to (I-VT with its defaults),
+    """Return the index (N,) of the first sample of the fixation that each sample belongs to, by the default limits,
     its own outside of fixations. ``rays`` are sorted by participant and time."""
-    label = detect_fixations_ivt(rays)
+    label, _ = label_fixations(rays)
     rows = np.flatnonzero(label >= 0)
     _, index, number = np.unique(label[rows], return_index=True, return_inverse=True)
     first = np.arange(len(rays))
