@@ -242,8 +242,8 @@ def place_objects(placed: PlacedAreas, poses: ObjectPoses) -> MovingAreas:
 
 
 def check_objects(moving: MovingAreas, blocks: Iterable[Rays], reporter: Reporter) -> None:
-    """Report for how many samples the pose of each object is unknown, and poses outside of the recording. Raises
-    `NergError` if no sample has a pose."""
+    """Report the offset of the clocks if poses and recording start together, for how many samples the pose of each
+    object is unknown, and poses outside of the recording. Raises `NergError` if no sample has a pose."""
     poses, count = moving.poses, 0
     unknown = dict.fromkeys(poses.names, 0)
     first, last = np.inf, -np.inf
@@ -253,18 +253,20 @@ def check_objects(moving: MovingAreas, blocks: Iterable[Rays], reporter: Reporte
         for name in poses.names:
             unknown[name] += int(poses.find_motion(name, rays).is_unknown.sum())
     times = poses.times[np.isfinite(poses.times)]
+    offset = first - float(times.min()) if len(times) else 0.0
+    together = f"if both start together, {parameter('clock_offset')} must be larger by {offset:.6g} s"
     if all(number == count for number in unknown.values()):
-        offset = first - float(times.min()) if len(times) else 0.0
         raise NergError(
             f"no sample ({count:,}, t {first:g} to {last:g} s) has a pose of an object ({poses.describe_times()}); "
-            "check the clocks and the participants: if both start together, add "
-            f"{offset:.6g} s to the times of the poses"
+            f"check the clocks and the participants: {together}"
         )
+    reporter.message(f"poses of objects are {poses.describe_times()}, samples t {first:g} to {last:g} s; {together}")
     for name, number in unknown.items():
         if number:
             reporter.warn(
                 f'the pose of the object "{sanitize(name, 40)}" is unknown for {number:,} of {count:,} samples, which '
-                f"see no such object: gaps above {poses.max_gap:g} s, or before its first or after its last pose"
+                f"see no such object: gaps above {poses.max_gap:g} s ({parameter('pose_gap')}), or before its first or "
+                "after its last pose"
             )
     if outside := int(((times < first) | (times > last)).sum()):
         reporter.message(f"{outside:,} of {len(times):,} poses of objects are outside of the recording")

@@ -23,7 +23,7 @@ from nerg_mi.formats.alignments import AnySimilarity, open_similarity
 from nerg_mi.interruption import Interruption
 from nerg_mi.maths.coordinates import check_coordinates
 from nerg_mi.progress import Progress, Reporter, open_reporter
-from nerg_mi.ranges import SEEDS, TIMES, Range, check_ranges
+from nerg_mi.ranges import SECONDS, SEEDS, TIMES, Range, check_ranges
 from nerg_mi.tasks.parts import PartRunner
 from nerg_mi.tasks.settings import Parallel
 from nerg_mi.tracking.dataset import RayDataset, open_recordings
@@ -85,6 +85,8 @@ def statistics(
     windows: Mapping[str, Sequence[float]] | None = None,
     zones: FilePath | AnyAreas | None = None,
     objects: FilePath | ObjectPoses | None = None,
+    pose_gap: Annotated[float, SECONDS] | None = None,
+    clock_offset: Annotated[float, TIMES] = 0.0,
     what_if: FilePath | Mapping[str, Any] | None = None,
     observers: ArrayLike | None = None,
     viewpoints: Annotated[int, Range(1, 100_000)] = 256,
@@ -134,6 +136,11 @@ def statistics(
     objects : ObjectPoses or path, optional
         Table with columns time,object,x,y,z,qw,qx,qy,qz (`nerg_mi.tracking.objects`): poses of shapes and areas that
         move, in the frame of the rays; without x,y,z an object is absent. Predictions ignore them.
+    pose_gap : float, optional
+        Longest time in seconds over which poses of objects are interpolated, or continued before the first and after
+        the last one. Default: 1, or as in poses in memory.
+    clock_offset : float
+        Seconds that are added to the times of the poses of objects, if their clock is not that of the rays.
     what_if : path or mapping, optional
         JSON file of changes to shapes and observers; the gaze field predicts their effect.
     observers : array_like of shape (M, 3), optional
@@ -204,7 +211,7 @@ def statistics(
     if align is not None and not isinstance(align, (str, os.PathLike)):
         align = open_similarity(align, "rays to scene").matrix.tolist()
     eyes = None if observers is None else _check_observers(observers)
-    poses = None if objects is None else ObjectPoses.open(objects)
+    poses = _open_poses(objects, pose_gap, clock_offset)
     plain_counting = Counting(rules, aoi_visibility=aoi_visibility, fov=fov, error=error, objects=poses)
     counting, counting_files = open_counting(plain_counting, windows, zones, cohorts, validation)
     files = [*existing_files(*chosen, *areas.files, what_if, align, objects), *counting_files]
@@ -280,6 +287,20 @@ def open_counting(
         validation=None if validation is None else to_path(validation),
     )
     return counting, existing_files(cohorts, validation, *(() if opened is None else opened.files))
+
+
+def _open_poses(
+    objects: FilePath | ObjectPoses | None, pose_gap: float | None, clock_offset: float
+) -> ObjectPoses | None:
+    if objects is None:
+        if pose_gap is not None or clock_offset:
+            raise NergError(
+                f"{parameter('pose_gap')} and {parameter('clock_offset')} are for poses of objects; add "
+                f"{parameter('objects', 'FILE')}"
+            )
+        return None
+    poses = ObjectPoses.open(objects).shift(clock_offset)
+    return poses if pose_gap is None else replace(poses, max_gap=pose_gap)
 
 
 def _make_windows(windows: Mapping[str, Sequence[float]]) -> tuple[TimeWindow, ...]:

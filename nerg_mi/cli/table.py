@@ -470,7 +470,8 @@ TABLE = (
         fastest=True,
         spellings={"windows": ("--window",), "observers": ("--observer",)},
         groups={
-            INPUT: ("aois", "align", "cohorts", "validation", "windows", "zones", "objects", "what_if", "observers"),
+            INPUT: ("aois", "align", "cohorts", "validation", "windows", "zones", "objects", "pose_gap", "clock_offset")
+            + ("what_if", "observers"),
             ANALYSIS: ("viewpoints", "aoi_visibility", "resamples", "power", "seed"),
             OUTPUT: ("min_participants", "show_names", "salt"),
         },

@@ -339,6 +339,23 @@ def test_frames_with_a_scale_and_a_mirror_are_transformed():
 
 
 @pytest.mark.usefixtures("rgb")
+def test_clocks_and_gaps_are_options():
+    recorder, made = Recorder(), poses()
+    expected = statistics([people(), room()], AREAS, objects=replace(made, max_gap=0.5), **FREE)
+    late = replace(made.shift(-7.5), max_gap=3.0)
+    options = {"pose_gap": 0.5, "clock_offset": 7.0, "progress": recorder}
+    result = statistics([people(), room()], AREAS, objects=late.shift(0.5), **options, **FREE)
+    assert result.aois == expected.aois != statistics([people(), room()], AREAS, objects=made, **FREE).aois
+    assert {"pose_gap": 0.5, "clock_offset": 7.0}.items() <= result.provenance.settings.items()
+    # Samples and poses start together without an offset.
+    off = statistics([people(), room()], AREAS, objects=made.shift(1.25), progress=recorder, **FREE)
+    reported = [text for text in recorder.messages if "clock_offset" in text]
+    assert off.aois != expected.aois and "-1.25 s" in reported[-1] and "by 0 s" in reported[0]
+    with pytest.raises(NergError, match="objects"):
+        statistics([people(), room()], AREAS, clock_offset=1.0)
+
+
+@pytest.mark.usefixtures("rgb")
 def test_bad_poses_are_named():
     rays, options = people(each=9), FREE
     for names in (["lamp"], ["box", "the box"]):
