@@ -18,7 +18,7 @@ from nerg_mi.files.values import FilePath
 from nerg_mi.tracking.rays import import_pyarrow
 
 from .charts import aois_figure, transitions_figure
-from .tables import MEASURES, MEASURES_BY_NAME, PREDICTED, ParticipantRows, Row, format_measure
+from .tables import MEASURES, MEASURES_BY_NAME, NO_INTERVAL, PREDICTED, ParticipantRows, Row, format_measure
 from .visits import VisitSums
 
 # ---- Tables ----
@@ -218,6 +218,23 @@ MAX_MATRIX_AREAS = 60  # maximum number of areas in the figure of transitions
 _COLUMNS = {"aois": aoi_columns, "differences": difference_columns, "what_if": what_if_columns}
 
 
+def _describe_largest(rows: Sequence[Row], source: str) -> str:
+    """Return a sentence on the largest share of time of the areas of a source."""
+    valid = [row for row in rows if row["share"] is not None]
+    if not valid:
+        return f"No {source} share of time is known."
+    shares = np.array([row["share"] for row in valid])
+    if not shares.any():
+        return f"No {source} gaze is on an area."
+    largest = [row for row, is_largest in zip(valid, np.isclose(shares, shares.max(), rtol=1e-9, atol=0)) if is_largest]
+    share = format_measure(largest[0], MEASURES_BY_NAME["share"])
+    share += f" ({NO_INTERVAL})" if largest[0].get("share_low") is None else ""
+    names = " and ".join(row["aoi"] for row in largest)
+    if len(valid) == 1:
+        return f"{names} has the {source} share of time {share}."
+    return f"{names} {'has' if len(largest) == 1 else 'have'} the largest {source} share of time: {share}."
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class StatisticsResult(ResultTables):
     """Attention statistics: tables as lists of dicts.
@@ -244,6 +261,8 @@ class StatisticsResult(ResultTables):
         Areas, and pairs of neighbours, that are too small for its accuracy.
     sums
         Sums that the tables were computed from.
+    groups
+        Names of the areas that are groups of others.
     num_suppressed
         Number of values that were suppressed because they rest on too few participants.
     provenance
@@ -272,22 +291,24 @@ class StatisticsResult(ResultTables):
     tracker: list[Row] = field(default_factory=list)
     resolution: list[Row] = field(default_factory=list)
     sums: VisitSums | None = None
+    groups: Sequence[str] = ()
     num_suppressed: int = 0
     provenance: style.Provenance = field(default_factory=lambda: style.Provenance("nerg stats"))
 
     @property
     def verdict(self) -> str:
-        """The area with the largest share, and the significant differences between cells, in short sentences, one a
-        line."""
-        lines = []
-        shares = [row for row in self.aois if row["cell"] == "all" and row["share"] is not None]
-        for source in dict.fromkeys(row["source"] for row in shares):
-            largest = max((row for row in shares if row["source"] == source), key=lambda row: row["share"])
-            share = format_measure(largest, MEASURES_BY_NAME["share"])
-            lines.append(f"{largest['aoi']} has the largest {source} share of time: {share}.")
+        """The area with the largest share, groups left out, and the significant differences between cells, in short
+        sentences, one a line."""
+        rows = [row for row in self.aois if row["cell"] == "all" and row["aoi"] not in self.groups]
+        lines = [] if rows else ["There are no areas."]
+        for source in dict.fromkeys(row["source"] for row in rows):
+            lines.append(_describe_largest([row for row in rows if row["source"] == source], source))
         if self.differences:
             significant = [row for row in self.differences if row["significant"]]
-            lines.append(f"{len(significant)} of {len(self.differences)} differences are significant.")
+            tested = sum(row["p_adjusted"] is not None for row in self.differences)
+            untested = len(self.differences) - tested
+            rest = f"; {untested} could not be tested, for lack of participants" if untested else ""
+            lines.append(f"{len(significant)} of {tested} tested differences are significant{rest}.")
             format_row = difference_columns(significant)[1]
             for cell, first, second, aoi, measure, difference, *_ in map(format_row, significant):
                 lines.append(f"{aoi}, {measure}: {difference} from {cell} {first} to {second}.")

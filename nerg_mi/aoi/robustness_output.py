@@ -74,7 +74,7 @@ def explain_variance(values: Sequence[Any], estimates: np.ndarray) -> float:
         return 0.0
     between = sum(len(g) * (g.mean() - y.mean()) ** 2 for g in groups)
     within = sum(((g - g.mean()) ** 2).sum() for g in groups) / (len(y) - len(groups))
-    with np.errstate(divide="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):  # 0 / 0: the choice, where it is made, changes nothing
         p = fdtrc(len(groups) - 1, len(y) - len(groups), np.divide(between / (len(groups) - 1), within))
     return float(np.clip((between - (len(groups) - 1) * within) / total, 0.0, 1.0)) if p < MAX_P else 0.0
 
@@ -160,6 +160,8 @@ class RobustnessResult(ResultTables):
         """How many differences survive, and which depend on choices, in short sentences, one a line."""
         differences = [row for row in self.conclusions if row["excludes_zero"] is not None]
         count = {name: sum(row["verdict"] == name for row in differences) for name in ("survives", "undecided")}
+        if not differences:
+            return "There are no areas or cells whose differences could be tested."
         lines = [
             f"{count['survives']} of {len(differences)} differences survive {len(self.analyses)} analyses with other "
             f"choices, and {count['undecided']} are undecided."

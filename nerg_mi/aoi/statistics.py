@@ -33,7 +33,7 @@ from nerg_mi.tracking.pseudonyms import make_pseudonyms, read_salt
 from nerg_mi.tracking.rays import TRACKING, Rays
 from nerg_mi.transport.observer import sensor_center
 
-from .areas import AnyAreas, Areas, to_json_values
+from .areas import AnyAreas, AreaGroup, Areas, to_json_values
 from .changes import open_changes
 from .estimates import MIN_FOR_INTERVAL
 from .measured import AoiContext, Counting, TimeWindow, count_block, iter_blocks
@@ -547,7 +547,9 @@ class AttentionAnalysis:
                 "durations": duration_rows(sums, suppression),
             }
             recorded["participants"] = self._list_participants(sums, show_names, salt)
-        return StatisticsResult(aois=rows, differences=differences, power=power_table, sums=sums, **recorded)
+        groups = [area.name for area in self.placed.areas.areas if isinstance(area, AreaGroup)]
+        tables = {"aois": rows, "differences": differences, "power": power_table}
+        return StatisticsResult(**tables, **recorded, sums=sums, groups=groups)
 
     def _make_tracker_tables(self, attention: MeasuredAttention) -> dict[str, list[Row]]:
         """Return the tables of the tracker's error."""

@@ -505,6 +505,8 @@ def _write_verdict(
     name_baseline = lambda name: _BASELINE_NAMES.get(name, name)
     if PRIOR not in outcome:
         return "none", f"No verdict for {label}: the evaluation has no {PRIOR}."
+    if all(math.isnan(difference.low) for c in comparisons for difference in c.differences):
+        return "none", f"No verdict for {label}: the scores have no intervals; evaluate with bootstrap resamples."
     for name in (UNIFORM, PRIOR):
         if outcome.get(name) == WORSE:
             return "reject", f"Worse than {name_baseline(name)} for {label}: do not use."

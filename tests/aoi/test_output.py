@@ -156,8 +156,27 @@ def test_the_verdict_names_the_largest_share_and_what_differs():
     differences = [difference | {"significant": True}, difference | {"aoi": "b", "significant": False}]
     largest, count, one = StatisticsResult(aois=rows, differences=differences).verdict.splitlines()
     assert largest.startswith("b ") and "30.0 % [25.0, 36.0]" in largest
-    assert count.startswith("1 of 2 ") and one.startswith("a, share of time: -6.00 points") and "front" in one
-    assert StatisticsResult().verdict == ""
+    assert count.startswith("1 of 2 tested") and one.startswith("a, share of time: -6.00 points") and "front" in one
+
+
+def test_the_verdict_of_edge_cases():
+    assert StatisticsResult().verdict == "There are no areas."
+    verdict = lambda *rows, **more: StatisticsResult(aois=[ROW_OF_AOI | row for row in rows], **more).verdict
+    low = ROW_OF_AOI["share"] / 2
+    # A group has no smaller share than its parts; equal ones are named together.
+    assert verdict({}, {"aoi": "all", "share": 1.0}, {"aoi": "b", "share": low}, groups=["all"]).startswith("a has")
+    assert verdict({}, {"aoi": "b"}, {"aoi": "c", "share": low}).startswith("a and b have")
+    assert "largest" not in verdict({}) and verdict({}).startswith("a has")
+    # One person has no interval, nobody looked, and all values are suppressed.
+    alone = {"share_low": None, "share_high": None}
+    assert "no interval" in verdict(alone, {"aoi": "b", "share": low})
+    assert verdict({"share": 0.0}, {"aoi": "b", "share": 0.0}).startswith("No measured gaze")
+    assert verdict({"share": None}).startswith("No measured share")
+    difference = {"cell": "zone", "first": "x", "second": "y", "aoi": "a", "measure": "share", "difference": 0.1}
+    difference |= {"low": None, "high": None, "p": None, "p_adjusted": None, "significant": False}
+    assert "0 of 0 tested" in verdict({}, differences=[difference]) and "1 could not" in verdict(
+        {}, differences=[difference]
+    )
 
 
 def test_many_participants_are_written_in_batches(tmp_path, monkeypatch):
