@@ -88,7 +88,7 @@ def draw_choices(choices: Choices, names: Container[str], num_fields: int, rng: 
         elif name not in names:
             continue
         elif name == "prior_weight":
-            choice[name] = None if value is None else float(rng.choice(np.linspace(*value, NUM_WEIGHTS)))
+            choice[name] = None if value is None else float(rng.choice(np.linspace(value[0], value[1], NUM_WEIGHTS)))
         elif isinstance(value[0], str):
             choice[name] = value[int(rng.integers(len(value)))]
         else:
@@ -323,7 +323,8 @@ class Evaluation:
                 keys = [Conclusion("areas", measure, self.areas[i], self.areas[j]) for i, j in pairs]
                 values |= dict(zip(keys, self._subtract(measure, (x[:, a], y[:, a]), (x[:, b], y[:, b]))))
             for place, k in enumerate(order[:3], 1):
-                values[Conclusion("rank", measure, self.areas[k], place)] = (own_ranks[measure][k], np.nan, np.nan)
+                rank = float(own_ranks[measure][k])
+                values[Conclusion("rank", measure, self.areas[k], place)] = (rank, np.nan, np.nan)
             for first, second in _pair_cells(people):
                 names = sorted({*people[first][0].names, *people[second][0].names})
                 one, other = (
@@ -491,6 +492,7 @@ def robustness(
                 placed, networks, measured.viewpoints, is_recorded, measured.times
             )
         else:
+            assert chosen.rays is not None
             gaze_fields, base = [], Analyses(placed, open_rays(chosen.rays), counting)
         for note in placed.warnings:
             reporter.message(note)
