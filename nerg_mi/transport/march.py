@@ -304,19 +304,23 @@ class ListMarchOp(MarchOp):
         color = None if f.color is None else f.color.zero()
         start = ListSums(active=f.active, light=Float(1), moment=Float(0), color=color)
         t0, t1 = (t + self.offset for t in self.inputs[3:])
+        # Most entries of a list are no hits of any ray of a packet.
+        skip = lambda state, hit, extra: (state, extra)
+        visit_hits = lambda *args: dr.if_stmt(args, args[0].active, visit, skip, label="derivatives of a hit")
         with dr.suspend_grad(), dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, True):
-            return self.lists.loop_hits(ray, t0, t1, start, visit, extra)[1]
+            return self.lists.loop_hits(ray, t0, t1, start, visit_hits, extra)[1]
 
     def _replay(self, leaves: list[Any], state: Any, place: ListHit) -> tuple[ReplayStep, Any]:
         lists, active, shader = self.lists, state.active, self.request.color
         (o, d, _, t0, _), (primal_o, primal_d, _, primal_t0, _) = leaves, self.inputs
         shift = (o - primal_o) - self.offset * (d - primal_d)
-        t, alpha, _ = lists.evaluate(place.rank, d, shift, active)
+        row = lists.gather_rows(place.rank, active)
+        t, alpha, _ = lists.evaluate(row, d, shift)
         goal, stop = self.limits
         after, weight, crosses = state.absorb(place, primal_t0 + self.offset, goal, stop)
         color = None
         if shader is not None:
-            color = lists.color(place.rank, cast("ColorShader", shader), active)
+            color = cast("ColorShader", shader).array_type(*row[13:])
             after.color = state.color + weight * dr.detach(color)
         distance = t - self.offset
         dtau = dr.select(active, -log1p(-alpha), 0)

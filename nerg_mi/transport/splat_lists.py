@@ -10,7 +10,7 @@ those of the same sums: a ray reads its list again (`march.ListMarchOp`).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
@@ -19,7 +19,7 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.maths.arrays import copy_aligned
-from nerg_mi.maths.types import Bool, Color, Float, Point3f, UInt32, Vector3f
+from nerg_mi.maths.types import Bool, Float, Point3f, UInt32, Vector3f
 
 from .jit import Fingerprint
 from .march_primal import MarchRequest, MarchResult, optical_depth_limits
@@ -185,21 +185,23 @@ class SplatLists(SplatHits):
         """Distance along ``ray`` from the viewpoint, through which its line passes, to its origin."""
         return dr.norm(ray.o - self.center) * dr.rsqrt(dr.squared_norm(ray.d))
 
-    def evaluate(self, rank: UInt32, d: Vector3f, shift: Vector3f | None, active: Bool) -> tuple[Float, Float, Float]:
-        """`SplatArrays.find_peak` of the Gaussian ``rank`` on the ray from the viewpoint, moved by ``shift``, in the
-        direction ``d``."""
-        at = lambda i: dr.gather(self._ns.Float, self.rows, rank * ROW_SIZE + i, active)
-        matrix = [at(i) for i in range(9)]
-        turn = lambda v: [dr.fma(matrix[i], v.x, dr.fma(matrix[i + 1], v.y, matrix[i + 2] * v.z)) for i in (0, 3, 6)]
-        from_center = [at(9), at(10), at(11)]
+    def evaluate(self, row: Sequence[Float], d: Vector3f, shift: Vector3f | None = None) -> tuple[Float, Float, Float]:
+        """`SplatArrays.find_peak` of the Gaussian with the numbers ``row`` on the ray from the viewpoint, moved by
+        ``shift``, in the direction ``d``."""
+        turn = lambda v: [dr.fma(row[i], v.x, dr.fma(row[i + 1], v.y, row[i + 2] * v.z)) for i in (0, 3, 6)]
+        from_center = row[9:12]
         if shift is not None:
             from_center = [a + b for a, b in zip(from_center, turn(shift))]
-        return find_peak(from_center, turn(d), at(12))
+        return find_peak(from_center, turn(d), row[12])
 
-    def color(self, rank: UInt32, shader: ColorShader, active: Bool) -> Color:
-        """Colour of the Gaussian ``rank``."""
-        at = lambda i: dr.gather(self._ns.Float, self.rows, rank * ROW_SIZE + i, active)
-        return shader.array_type(at(13), at(14), at(15))
+    def gather(self, rank: UInt32, numbers: range, active: Bool) -> list[Float]:
+        """The ``numbers`` of the rows of the Gaussians ``rank``."""
+        return [dr.gather(self._ns.Float, self.rows, rank * ROW_SIZE + i, active) for i in numbers]
+
+    def gather_rows(self, rank: UInt32, active: Bool) -> list[Float]:
+        """All numbers: slower, but their derivatives are added together."""
+        shape = (ROW_SIZE, dr.width(rank))
+        return list(dr.gather(self._ns.ArrayXf, self.rows, rank, active, shape=shape))
 
     def loop_hits(
         self, ray: LocalRay, t0: Float, t1: Float, start: Any, visit: Callable[..., Any], extra: Any = None
@@ -222,7 +224,8 @@ class SplatLists(SplatHits):
         def read(walk: _ListWalk) -> tuple[_ListWalk]:
             """Read an entry of the list, and process the nearest hit that is known by then."""
             rank = dr.gather(ns.UInt32, self._entries, walk.entry, walk.active)
-            t, alpha, distance = self.evaluate(rank, ray.d, None, walk.active)
+            row = self.gather(rank, range(13), walk.active)
+            t, alpha, distance = self.evaluate(row, ray.d)
             hit = walk.active & (t >= t0) & (t < t1) & (alpha >= MIN_ALPHA) & (distance < self.arrays.extent**2)
             # What is no hit comes first, and absorbs nothing.
             new = ListHit(dr.select(hit, t, -dr.inf), dr.select(hit, alpha, 0), rank)
@@ -255,7 +258,7 @@ class SplatLists(SplatHits):
             after.median = dr.select(crosses, hit.t, state.median)
             after.light_before = dr.select(crosses, state.light, state.light_before)
             if isinstance(shader, ColorShader):
-                after.color = state.color + weight * self.color(hit.rank, shader, active)
+                after.color = state.color + weight * shader.array_type(*self.gather(hit.rank, range(13, 16), active))
             elif shader is not None:
                 index = dr.gather(ns.UInt32, self._indices, hit.rank, active)
                 p = ray.o + ray.d * (hit.t - offset)
