@@ -30,10 +30,10 @@ from .points import FramePace, PinholeView, StagePicture, override_attribute, ro
 _COLOR_CUTOFF = 0.5
 """`MarchSettings.color_cutoff` of drafts of a compiled field: colour takes most of their time."""
 
-_SPLAT_STOP = 0.02
+_SPLAT_STOP = 0.05
 """`MarchSettings.stop` of drafts of splats."""
 
-_SPLAT_CELLS = 40
+_SPLAT_CELLS = 96
 """Cells of the lists of splats across a frame of any width: with another number, kernels are compiled again."""
 
 _MAP_HEIGHT = 192
