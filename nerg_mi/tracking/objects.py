@@ -10,6 +10,8 @@ A table of poses (CSV or Parquet) has a row for each time and object, with the c
   object's frame to that of the samples;
 - optionally ``person``, if participants have poses of their own; an empty one stands for all others.
 
+Tables of objects of Aria's HOT3D (object_uid, timestamp[ns], t_wo_x[m], q_wo_w, ...) are read as they are.
+
 The environment shows each object in its pose in the row without a time or, if there is none, in its first row. What
 counts is the motion from there, so that the origin of an object's frame does not matter.
 """
@@ -231,9 +233,12 @@ class ObjectPoses:
         """Read a table of poses as described above. Raises `NergError` for missing columns and invalid rows."""
         path = to_path(path)
         table = ColumnFinder(path)
-        time, position = table.require_time("time", "t", "timestamp"), table.require_vector("", "position", "pos")
-        turn = table.find_vector("q", "quaternion", "rotation", "rot", "orientation", axes="xyzw") or ()
-        name, person = table.find("object", "object_name", "name"), table.find(*PERSON_NAMES)
+        time, position = (
+            table.require_time("time", "t", "timestamp"),
+            table.require_vector("", "position", "pos", "t_wo"),
+        )
+        turn = table.find_vector("q", "quaternion", "rotation", "rot", "orientation", "q_wo", axes="xyzw") or ()
+        name, person = table.find("object", "object_name", "name", "object_uid"), table.find(*PERSON_NAMES)
         if name is None:
             raise NergError(f'"{path}" has no column object; name the object of each row in it')
 

@@ -309,6 +309,13 @@ def test_tables_are_read(tmp_path):
     assert np.allclose(motion.rotation, [quarter, quarter, np.eye(3), np.eye(3)])
     # The point (1, 0, 0) of its pose in the environment is at (2, 0, 0).
     assert np.allclose(motion.move(np.array([[1.0, 0, 0]]))[:, 0, 0], [2, 2, 1, 1])
+    file.write_text(
+        "object_uid,timestamp[ns],t_wo_x[m],t_wo_y[m],t_wo_z[m],q_wo_w,q_wo_x,q_wo_y,q_wo_z\n"
+        f"77,1000000000,1,0,0,1,0,0,0\n77,2000000000,2,0,0,{half},0,0,{half}\n"
+    )
+    poses = ObjectPoses.load(file)
+    assert poses.names == ("77",) and poses.times.tolist() == [1, 2]
+    assert np.allclose(poses.find_motion("77", replace(rays, t=rays.t + 0.5)).rotation[1::2], quarter)
     for text in (
         "time,object,x,y\n0,a,1,0\n",
         "time,x,y,z\n0,1,0,0\n",
