@@ -55,6 +55,7 @@ from .statistics_parts import (
     write_sums,
 )
 from .tables import MEASURED, MEASURES_BY_NAME, PREDICTED, MinParticipantsFilter, Pair, Participants, Row
+from .tracker_error import describe_tracker_fixations
 from .visits import ALL, Cell, VisitSums, merge_sums
 
 # ---- Choices ----
@@ -185,12 +186,14 @@ class Analyses:
 @dataclass(frozen=True, eq=False)
 class Predictions:
     """Predicts attention with other choices: of ``viewpoints`` in the ``placed`` areas, recorded or not, by one of the
-    ``networks`` (`list_networks`). ``times`` are the recorded seconds of each participant by cell."""
+    ``networks`` (`list_networks`). ``sigma`` is the error of the eye tracker in radians, as for `predict_attention`,
+    and ``times`` are the recorded seconds of each participant by cell."""
 
     placed: PlacedAreas
     networks: Sequence[GazeNetwork]
     viewpoints: Viewpoints
     is_recorded: bool
+    sigma: float = 0.0
     times: Mapping[Cell, dict[str, float]] = field(default_factory=dict)
 
     def get_reference(self) -> Row:
@@ -198,7 +201,8 @@ class Predictions:
         sampling = self.placed.sampling
         reference: Row = {"margin": sampling.margin, "growth": 0.0, "glance_duration": sampling.glance_duration}
         reference |= dict.fromkeys(("rotation", "shift_x", "shift_y", "shift_z"), 0.0)
-        return reference | {"weighting": "participants", "prior_weight": None, "field": 0}
+        reference |= {"weighting": "participants", "prior_weight": None, "field": 0}
+        return reference | {"tracker": "corrected" if self.sigma > 0 else "ignored"}
 
     def compute(self, choice: Mapping[str, Any]) -> PredictedAttention:
         """Predict the attention with these choices. The field is moved with the tracking that it was trained on."""
@@ -215,15 +219,19 @@ class Predictions:
         if self.is_recorded:
             positions = viewpoints.positions @ motion[:3, :3].T + motion[:3, 3]
             viewpoints = replace(viewpoints, positions=positions)
-        return predict_attention(placed, viewpoints, fov=360.0)  # no measure here depends on the field of view
+        sigma = self.sigma if choice["tracker"] == "corrected" else 0.0
+        return predict_attention(placed, viewpoints, 360.0, sigma=sigma)  # nothing here depends on the field of view
 
     def find_people(self, predicted: PredictedAttention, choice: Mapping[str, Any]) -> People:
         """Return the participants of an analysis."""
-        duration, people = choice["glance_duration"], {}
+        duration, people = choice["glance_duration"], dict[Cell, list[Participants]]()
+        levels = [predicted.share, *([] if predicted.disturbed is None else predicted.disturbed)]
         for cell, times in self.times.items():
-            of_cell = aggregate_by_participant(predicted, self.viewpoints, cell, times, duration)
-            if of_cell is not None:
-                people[cell] = [of_cell]
+            for share in levels:
+                level = replace(predicted, share=share)
+                of_cell = aggregate_by_participant(level, self.viewpoints, cell, times, duration)
+                if of_cell is not None:
+                    people.setdefault(cell, []).append(of_cell)
         return people
 
 
@@ -266,12 +274,13 @@ class PlannedPredictions:
     gaze_fields: tuple[Path, ...]
     poses: ObserverPoses
     is_recorded: bool
+    sigma: float
 
     def open(self) -> Predictions:
         """Load the files."""
         placed = self.areas.open()
         networks = list_networks([GazeField.load(file) for file in self.gaze_fields])
-        return Predictions(placed, networks, self.poses.to_viewpoints(), self.is_recorded)
+        return Predictions(placed, networks, self.poses.to_viewpoints(), self.is_recorded, self.sigma)
 
 
 def predict_analysis(common: PlannedPredictions, choice: Mapping[str, Any], output: Path) -> None:
@@ -480,16 +489,15 @@ def robustness(
         placed = open_placed_areas(chosen.environment, chosen.gaze, areas, align, sampling)
         if gaze_inputs:
             gaze_fields = _open_gaze_fields([chosen.gaze, *gaze_inputs[1:]])
-            if counting.has_error:
-                reporter.message("predictions are not corrected for the error of the tracker, as nerg stats does")
             plain = replace(counting, error=TrackerError(), validation=None)
             observed = None if chosen.rays is None else open_recordings(chosen.rays)
             measured = AttentionAnalysis(
                 placed, observed, plain, None, MinParticipantsFilter(), resamples, seed, reporter
             ).measure(viewpoints, None, ObserverGrid())
             is_recorded, networks = observed is not None, list_networks(gaze_fields)
+            sigma = counting.disturbance.sigma if counting.has_error else 0.0
             base: Analyses | Predictions = Predictions(
-                placed, networks, measured.viewpoints, is_recorded, measured.times
+                placed, networks, measured.viewpoints, is_recorded, sigma, measured.times
             )
         else:
             assert chosen.rays is not None
@@ -497,7 +505,7 @@ def robustness(
         for note in placed.warnings:
             reporter.message(note)
         choices = _adapt_choices(choices, base, align, reporter)
-        changed |= _describe_fixations(base, choices)
+        changed |= _describe_fixations(base, choices) | describe_tracker_fixations(error)
         reference, num_fields = base.get_reference(), len(base.networks) - 1 if isinstance(base, Predictions) else 0
         rngs = [np.random.default_rng((seed, k)) for k in range(analyses)]
         drawn = [draw_choices(choices, reference.keys(), num_fields, rng) for rng in rngs]
@@ -560,6 +568,8 @@ def _adapt_to_fields(choices: Choices, base: Predictions, reporter: Reporter) ->
         )
     if not base.is_recorded:
         choices = replace(choices, weighting=("participants",))
+    if not base.sigma > 0:
+        choices = replace(choices, tracker=("ignored",))
     if not all(config.prior for config in configs):
         if choices.prior_weight is not None:
             raise NergError("a gaze field has no prior, whose weight could be varied; leave out prior_weight")
@@ -646,7 +656,7 @@ def _compute_in_parts(
         if isinstance(base, Predictions):
             poses = ObserverPoses(base.viewpoints.positions, base.viewpoints.facing)
             planned = planner.plan_areas("margin", "aoi_samples", "directions")
-            common: Any = PlannedPredictions(planned, files, poses, base.is_recorded)
+            common: Any = PlannedPredictions(planned, files, poses, base.is_recorded, base.sigma)
             for output in runner.run(planner.make_plan(job, predict_analysis, common, parts)):
                 yield read_prediction(output.path)
         else:

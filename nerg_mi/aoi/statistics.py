@@ -70,7 +70,7 @@ from .tables import (
     duration_rows,
     transition_rows,
 )
-from .tracker_error import LEVELS, resolution_rows, tracker_rows
+from .tracker_error import LEVELS, describe_tracker_fixations, resolution_rows, tracker_rows
 from .visits import ALL, Cell, VisitSums, merge_sums
 
 
@@ -241,6 +241,7 @@ def statistics(
             changes = None if what_if is None else open_changes(what_if)
             files += [] if changes is None else changes.meshes
             changed |= {} if work.rays is None else read_fixations(work.rays.metadata)
+            changed |= describe_tracker_fixations(error)
             attention = work.measure(viewpoints, eyes, grid)
             result = work.make_tables(attention, power, show_names, salt)
             if changes is not None and attention.predicted is not None:

@@ -6,10 +6,12 @@ import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 
 from nerg_mi.environment.sampler import DirectionQuery
+from nerg_mi.tracking.event_settings import EventRules
 from nerg_mi.tracking.events import label_fixations
 from nerg_mi.tracking.rays import Rays
 
@@ -113,6 +115,11 @@ def find_first_of_fixation(rays: Rays) -> np.ndarray:
     first = np.arange(len(rays))
     first[rows] = rows[index][number]
     return first
+
+
+def describe_tracker_fixations(error: TrackerError) -> dict[str, Any]:
+    """Return ``{"tracker_fixations": definition}`` if an offset changes between fixations, as settings record it."""
+    return {"tracker_fixations": EventRules().describe()} if error.fixation_part > 0 else {}
 
 
 def turn_directions(directions: np.ndarray, angles: np.ndarray) -> np.ndarray:

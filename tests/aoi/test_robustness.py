@@ -153,6 +153,26 @@ def test13_fields_and_priors_decide(tmp_path, rgb):
     assert np.allclose(line(weights), estimates, atol=0.02 * np.ptp(estimates))
 
 
+def test16_predictions_are_corrected_for_the_tracker(tmp_path, rgb):
+    write_place(tmp_path, gaze=False)
+    gaze = write_gaze(tmp_path / "gaze.safetensors", 1)
+    inputs, areas = [tmp_path / "scene.xml", people(each=40, cohorts=False), gaze], tmp_path / "areas.json"
+    settings = {"error": TrackerError(accuracy=3.0), **COARSE}
+    choices = replace(FIXED, prior_weight=(0.3, 0.3))
+    result = nerg.robustness(inputs, areas, analyses=10, choices=choices, **settings)
+    rows = nerg.statistics(inputs, areas, resamples=199, **settings).tracker
+    values = {row["aoi"]: row for row in rows if (row["source"], row["measure"]) == ("predicted", "share")}
+    (row,) = (r for r in result.conclusions if " > " in r["conclusion"] and r["measure"] == "share")
+    one, other = (values[name] for name in row["conclusion"].split(" > "))
+    assert row["reference"] == pytest.approx(one["corrected"] - other["corrected"], rel=1e-6)
+    assert all(file.is_file() for file in result.save(tmp_path / "out"))
+    ignored = [a["tracker"] == "ignored" for a in result.analyses]
+    estimates = estimates_of(result, row["conclusion"])
+    assert 0 < sum(ignored) < 10
+    assert np.allclose(estimates[ignored], one["recorded"] - other["recorded"], rtol=1e-6)
+    assert np.allclose(estimates[~np.array(ignored)], row["reference"], rtol=1e-6)
+
+
 def test14_a_field_moves_with_its_tracking(tmp_path, rgb):
     """Where surfaces are unknown, a shift of the tracking is the opposite shift of all areas."""
     gaze = nerg.GazeField.load(write_gaze(tmp_path / "gaze.safetensors", 3, geometry="none"))

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import nerg_mi as nerg
-from nerg_mi.aoi.settings import Choices
+from nerg_mi.aoi.settings import Choices, TrackerError
 from nerg_mi.formats.ply import write_columns
 from nerg_mi.interop.scenes import export_scene
 from nerg_mi.reports.data import ParticipantLabels, anonymize_rays
@@ -96,9 +96,11 @@ def test_files_of_fixations_state_the_definition(reduced, tmp_path):
 
 def test_numbers_from_fixations_state_the_definition(looks, reduced, tmp_path, rgb):
     areas = {"left": [[1.9, 0, -1], [2, 1, 1]], "right": [[1.9, -1, -1], [2, 0, 1]]}
-    nerg.statistics(reduced, areas, resamples=199).save(tmp_path / "stats")
+    error = TrackerError(accuracy=1.0, fixation_part=0.5, draws=2)
+    nerg.statistics(reduced, areas, resamples=199, error=error).save(tmp_path / "stats")
     of_file = lambda folder: json.loads((tmp_path / folder / "about.json").read_text())["settings"]
     assert matches(of_file("stats")["fixations"])
+    assert matches(of_file("stats")["tracker_fixations"], EventRules().describe())
     choices = Choices(velocity=(70, 90), min_fixation=(0.06, 0.1))
     nerg.robustness(looks, areas, analyses=10, choices=choices).save(tmp_path / "choices")
     drawn = EventRules().describe() | {"velocity": [70, 90], "min_fixation": [0.06, 0.1]}
