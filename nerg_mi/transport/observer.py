@@ -18,7 +18,7 @@ from .geometry import SURFACE_OPACITY, SceneGeometry
 from .jit import Fingerprint, fingerprint_shapes, is_recording
 from .march_primal import MarchSettings
 from .recording import Recorder
-from .splat_lists import CELL_PIXELS, Window
+from .splat_lists import CAMERA_CELLS, Window
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -279,6 +279,7 @@ def camera_windows(sensor: mi.Sensor) -> tuple[Window, ...] | None:
     axes = np.array([np.array(dr.detach(axis)).ravel() for axis in axes], np.float64)
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
     x, y, z = axes @ np.array(dr.detach(corners), np.float64)
+    pixels = int(np.clip(round(np.sqrt(np.prod(film.crop_size()) / CAMERA_CELLS)), 4, 16))
     lower, upper, cells = [], [], []
     for axis, (first, last), size in (
         (0, (x / z)[[0, 1]], film.crop_size()[0]),
@@ -287,8 +288,8 @@ def camera_windows(sensor: mi.Sensor) -> tuple[Window, ...] | None:
         if last < first:
             axes[axis], first, last = -axes[axis], -first, -last
         # One more cell on both sides: a film can sample its border.
-        count = -(-int(size) // CELL_PIXELS)
-        edge = (last - first) / size * CELL_PIXELS
+        count = -(-int(size) // pixels)
+        edge = (last - first) / size * pixels
         lower.append(float(first - edge))
         upper.append(float(first + (count + 1) * edge))
         cells.append(count + 2)

@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 MIN_ALPHA = 1 / 255
 """Absorbed fraction below which a Gaussian is left out, as in 3DGS."""
 
-CELL_PIXELS = 16
-"""Edge of a cell of a camera in pixels."""
+CAMERA_CELLS = 1 << 14
+"""Approximate number of cells of a camera: fewer have longer lists, and more take longer to fill."""
 
 ROW_SIZE = 16
 """Numbers per Gaussian: the matrix to its own axes, the vector from its centre to the viewpoint there, its opacity and
