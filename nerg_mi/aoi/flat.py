@@ -407,20 +407,14 @@ def _fit_area(placed: PlacedAreas, elements: tuple[int, ...], observers: np.ndar
 
 
 def _read_corners(aoi: ShapeAoi) -> np.ndarray:
-    """Return points (P, 3) of a shape, with those on its borders. Raises `NergError` for a curved shape."""
-    import mitsuba as mi
-
-    if aoi.shape.is_mesh():
-        vertices, faces = read_triangles(aoi.shape)
-        return vertices[np.unique(faces)]
-    if aoi.shape.class_name() != "Rectangle":
+    """Return the vertices (P, 3) of a shape. Raises `NergError` for a shape without triangles."""
+    if not aoi.shape.is_mesh():
         raise NergError(
             f'the area "{sanitize(aoi.name, 40)}" is a {aoi.shape.class_name()}, which has no corners; give four with '
             f"{parameter('corners')}"
         )
-    params: Any = mi.traverse(aoi.shape)
-    to_world = np.array(params["to_world"].matrix, float).reshape(4, 4)
-    return np.array([[x, y, 0, 1] for x in (-1, 1) for y in (-1, 1)]) @ to_world[:3].T
+    vertices, faces = read_triangles(aoi.shape)
+    return vertices[np.unique(faces)]
 
 
 def _list_samples(
