@@ -1,48 +1,78 @@
-"""Images a second of the viewer while the camera or the observer moves, without a browser.
+"""Images a second and latency of the viewer while the camera or the observer moves, without a browser.
 
-    python benchmarks/viewer_frames.py SCENE.xml [--width 640] [--seconds 4]
+    python benchmarks/viewer_frames.py SCENE.xml [--width 640] [--seconds 4] [--frame-width WIDTH] [--splats FILE]
+    [--pictures FOLDER]
 
-The page gets 60 changes a second. Each image is rendered, coloured and encoded as for a browser, but not sent. The rows
-are the scene's own radiance field and its compiled copy, which is made next to the field if there is none. "Full
-resolution" is the time from the end of a movement to the first image of the full width.
+The page gets 60 changes a second. Each image is rendered, coloured and encoded as for a browser, but not sent. Rows are
+the scene with the compiled copy of its radiance field, which is made next to the field if there is none; with Gaussian
+splats in place of the field, by default about 200,000 that are made of it; and with the field itself. CPU time is that
+of the process for each image. The latency of an image is the time from the change that it shows to its encoded form.
+"Full resolution" is the time from the end of a movement to the first image of the full width.
 """
 
 from __future__ import annotations
 
 import argparse
-import io
 import threading
 import time
 from collections import Counter
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
+import splats
+from timing import median, save_result
 
 import numpy as np
 
 RATE = 60  # Changes a second
 REACH = 0.3  # Amplitude of the movement, scene units
+RESOLUTION = 222  # Lattice of the splats
+
+
+@dataclass
+class Image:
+    """An encoded image of a movement: when it was complete, its shape, and seconds of its parts."""
+
+    time: float
+    shape: tuple[int, ...]
+    waiting: float
+    rendering: float
+    encoding: float
+
+    @property
+    def latency(self) -> float:
+        return self.waiting + self.rendering + self.encoding
 
 
 class Client:
-    """A browser that only records the sizes and times of its images."""
+    """A browser that only records its images."""
 
     client_id = 1
 
-    def __init__(self) -> None:
-        self.scene, self.images = self, list[tuple[float, tuple[int, int]]]()
+    def __init__(self, pictures: Path | None) -> None:
+        self.scene, self.images, self.pictures = self, list[Image](), pictures
+        # When the displayed change was made, and when its image was begun.
+        self.change = self.begin = 0.0
 
     def atomic(self) -> Any:
         return threading.RLock()
 
     def set_background_image(self, image: np.ndarray | None, format: str = "", jpeg_quality: int = 90) -> None:
-        from PIL import Image
+        from viser._image_encoding import cv2_imencode_with_fallback
 
-        if image is not None:
-            Image.fromarray(image).save(io.BytesIO(), "JPEG", quality=jpeg_quality)
-            self.images.append((time.monotonic(), image.shape[:2]))
+        if image is None:
+            return
+        start = time.monotonic()
+        data = cv2_imencode_with_fallback("jpeg", image, jpeg_quality, channel_ordering="rgb")
+        end = time.monotonic()
+        self.images.append(Image(end, image.shape[:2], self.begin - self.change, start - self.begin, end - start))
+        if self.pictures is not None and len(self.images) % 40 == 1:
+            self.pictures.mkdir(parents=True, exist_ok=True)
+            (self.pictures / f"{len(self.images):05}.jpg").write_bytes(data)
 
 
 class Listener:
@@ -57,55 +87,78 @@ class Listener:
         raise error
 
 
-def measure(scene: Path, width: int, seconds: float, compile: bool) -> list[list[str]]:
-    """Rows of the table: a moving camera, and a moving observer."""
+def measure(name: str, load: Callable[[], Any], args: argparse.Namespace) -> list[list[str]]:
+    """Rows of the table for the environment ``name``: a moving camera, and a moving observer."""
     from nerg_mi.viewer.page import REST_SECONDS, BrowserWindow, Page
-    from nerg_mi.viewer.points import PinholeView
+    from nerg_mi.viewer.points import FRAME_WIDTHS, PinholeView
     from nerg_mi.viewer.session import Session, SessionSettings
-    from nerg_mi.viewer.source import open_viewer_inputs
 
-    settings = SessionSettings(width=width, compile=compile)
-    session = Session(lambda: open_viewer_inputs(scene), settings, Listener())
+    width, seconds, pictures, compile = args.width, args.seconds, args.pictures, name == "compiled"
+    session = Session(load, SessionSettings(width=width, spp=1, compile=compile), Listener())
     session.start()
     try:
         while compile and session.compiled is None:
             time.sleep(0.1)
         session.worker.wait_idle(600)
-        page, client = Page(None), Client()
+        page, client = Page(None), Client(None)
         page.session = session
         home = replace(session.home_view, aspect=16 / 9)
         window = page.windows[1] = BrowserWindow(client, None, view=home)
-        page._start_refinement(window)
-        session.worker.wait_idle(600)
-        rows, eye = [], session.observer
+        changes, make_frame = {id(home): 0.0}, session._make_frame
+        last = 0.0
+
+        def record_frame(view: PinholeView, *args: Any, **options: Any) -> Any:
+            client.begin = time.monotonic()
+            client.change = changes.get(id(view), client.begin) if moving == "camera" else last
+            return make_frame(view, *args, **options)
+
+        session._make_frame = record_frame
+        if args.frame_width:
+            session.choose_frame_width = lambda view: args.frame_width
+        rows, eye, views, moving = [], session.observer, [home], "camera"
         for moving in ("camera", "observer"):
+            page._start_refinement(window)
+            session.worker.wait_idle(600)
+            # Kernels are compiled, and what the images replay is recorded.
+            for _ in range(3):
+                session.worker.call(lambda: make_frame(home, args.frame_width or FRAME_WIDTHS[0])).result()
             client.images.clear()
-            start = time.monotonic()
+            client.pictures = None if pictures is None else pictures / f"{name} {moving}".replace(" ", "-")
+            start, used = time.monotonic(), time.process_time()
             while (t := time.monotonic() - start) < seconds:
                 offset = REACH * np.sin(t) * np.cross(home.forward, home.up)
+                last = time.monotonic()
                 if moving == "camera":
                     with page._lock:
                         window.view = PinholeView.look_at(
                             home.origin + offset, home.origin + home.forward, home.up, home.fov, home.aspect
                         )
-                        page._hide_picture(window, time.monotonic())
+                        views.append(window.view)
+                        changes[id(window.view)] = last
+                        page._hide_picture(window, last)
                 else:
                     session.place_observer(eye + offset)
                     page._on_observer_moved(False)
                 time.sleep(1 / RATE)
-            images = list(client.images)
+            end, used = time.monotonic(), time.process_time() - used
+            images = [image for image in client.images if image.time <= end]
             client.images.clear()
-            end = time.monotonic()
             time.sleep(REST_SECONDS)
             window.is_handled = True
             page._start_refinement(window)
-            while not (full := [t for t, (_, w) in client.images if w == width]):
+            while not (full := [image.time for image in client.images if image.shape[1] == width]):
                 time.sleep(0.005)
             session.worker.wait_idle(600)
-            sizes = Counter(f"{w} x {h}" for _, (h, w) in images)
-            name = sizes.most_common(1)[0][0] if sizes else "points"
-            row = ["compiled" if compile else "field", moving, name]
-            rows.append([*row, f"{len(images) / seconds:.1f}", f"{full[0] - end:.2f}"])
+            sizes = Counter(f"{image.shape[1]} x {image.shape[0]}" for image in images)
+            row = [name, moving, sizes.most_common(1)[0][0] if sizes else "points", f"{len(images) / seconds:.1f}"]
+            if images:
+                latency, *parts = (
+                    [1e3 * getattr(image, part) for image in images]
+                    for part in ("latency", "waiting", "rendering", "encoding")
+                )
+                row += [f"{1e3 * used / len(images):.0f}", f"{median(latency):.0f} ({np.quantile(latency, 0.95):.0f})"]
+                row += [f"{median(part):.1f}" for part in parts]
+            rows.append([*row, *[""] * (9 - len(row)), f"{full[0] - end:.2f}"])
         return rows
     finally:
         session.stop()
@@ -113,18 +166,46 @@ def measure(scene: Path, width: int, seconds: float, compile: bool) -> list[list
 
 def main(argv=None) -> None:
     from nerg_mi.cli.declarations import select_backend
-    from timing import save_result
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", type=Path)
     parser.add_argument("--width", type=int, default=640, help="width of the full resolution, pixels (default: 640)")
     parser.add_argument("--seconds", type=float, default=4, help="length of a movement (default: 4)")
+    parser.add_argument(
+        "--frame-width", type=int, default=0, help="width of images of a movement (default: that which is fast enough)"
+    )
+    parser.add_argument("--splats", type=Path, help="splats of the environment (default: made of the demo store)")
+    parser.add_argument("--pictures", type=Path, help="folder for every 40th image (default: none)")
+    parser.add_argument(
+        "--only", default="compiled,splats,field", help="environments, separated by commas (default: all)"
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path("out/benchmarks/viewer"), help="folder for files (default: %(default)s)"
+    )
     args = parser.parse_args(argv)
     select_backend("llvm_ad_rgb")
+    import nerg_mi as nerg
+    from nerg_mi.scenes.store import SCENE_FILE
+    from nerg_mi.viewer.source import open_viewer_inputs
+
+    def load_splats() -> Any:
+        files = {"field": args.splats.resolve(), "gaze": SCENE_FILE.with_name("shoppers.safetensors").resolve()}
+        return open_viewer_inputs(nerg.Scene.load(splats.splat_scene(args.out), **files))
+
+    loaders = {"compiled": partial(open_viewer_inputs, args.scene), "splats": load_splats}
+    requested = args.only.split(",")
+    if "splats" in requested and args.splats is None:
+        args.splats = args.out / "store.ply"
+        if not args.splats.is_file():
+            splats.make(args.splats, RESOLUTION)
+    args.out.mkdir(parents=True, exist_ok=True)
     rows = []
-    for compile in (True, False):
-        rows += measure(args.scene, args.width, args.seconds, compile)
-    save_result("viewer", ("density", "moving", "usual size", "images a second", "full resolution, s"), rows)
+    for name in requested:
+        load = loaders.get(name, loaders["compiled"])
+        rows += measure(name, load, args)
+    parts = ("waiting", "rendering", "encoding")
+    columns = ("environment", "moving", "usual size", "images a second", "CPU time, ms", "latency (95 %), ms")
+    save_result("viewer", (*columns, *(f"{part}, ms" for part in parts), "full resolution, s"), rows)
 
 
 if __name__ == "__main__":
