@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any, ClassVar, cast
@@ -197,7 +198,7 @@ class SplatArrays:
         return [dr.maximum(total, 0) for total in sums]
 
 
-def find_peak(from_center: list[Float], along: list[Float], opacity: Float) -> tuple[Float, Float, Float]:
+def find_peak(from_center: Sequence[Float], along: Sequence[Float], opacity: Float) -> tuple[Float, Float, Float]:
     """`SplatArrays.find_peak` on a ray in the axes of a Gaussian, in standard deviations: ``from_center`` to the origin
     of the ray, and its displacement ``along`` per unit of t."""
     square = _dot(along, along)
@@ -207,7 +208,7 @@ def find_peak(from_center: list[Float], along: list[Float], opacity: Float) -> t
     return t, dr.minimum(opacity * dr.exp(-0.5 * distance), MAX_ALPHA), distance
 
 
-def _dot(a: list[Float], b: list[Float]) -> Float:
+def _dot(a: Sequence[Float], b: Sequence[Float]) -> Float:
     return dr.fma(a[0], b[0], dr.fma(a[1], b[1], a[2] * b[2]))
 
 
