@@ -9,13 +9,13 @@ error of the same mean angle; the mean probability is the expected share, which 
 
 from __future__ import annotations
 
+import argparse
+
 import nerg_mi as nerg
 from nerg_mi.aoi.settings import TrackerError, VisitRules
 from timing import save_result
 
 import numpy as np
-from gazeaudit.aoi import RectangleAOI
-from gazeaudit.uncertainty import GaussianGazeErrorModel, aoi_probabilities
 from scipy.stats import norm
 
 PARTICIPANTS, DRAWS, DISTANCE = 2000, 200, 100.0
@@ -25,6 +25,9 @@ RECTANGLES = [(-7, -3, -4, -2), (-3, 0, -3, -1), (0, 6, -4, 0), (-7, -2, 0, 3), 
 
 def compute_shares(at: np.ndarray, accuracy: float) -> np.ndarray:
     """Expected shares (3, 6) by nerg_mi, by GazeAudit and by the normal distribution function of points (N, 2)."""
+    from gazeaudit.aoi import RectangleAOI
+    from gazeaudit.uncertainty import GaussianGazeErrorModel, aoi_probabilities
+
     right, up = DISTANCE * np.tan(np.radians(at)).T
     directions = np.stack([np.full_like(right, DISTANCE), -right, up], axis=1)
     directions = np.repeat(directions / np.linalg.norm(directions, axis=1, keepdims=True), 2, axis=0)
@@ -56,6 +59,7 @@ def compute_shares(at: np.ndarray, accuracy: float) -> np.ndarray:
 
 
 def main() -> None:
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     at, rows = np.random.default_rng(0).uniform([-9, -6], [8, 6], (PARTICIPANTS, 2)), []
     for accuracy in (0.5, 1.2, 2.5):
         disturbed, theirs, exact = compute_shares(at, accuracy)
