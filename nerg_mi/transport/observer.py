@@ -279,7 +279,7 @@ def camera_windows(sensor: mi.Sensor) -> tuple[Window, ...] | None:
     axes = np.array([np.array(dr.detach(axis)).ravel() for axis in axes], np.float64)
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
     x, y, z = axes @ np.array(dr.detach(corners), np.float64)
-    pixels = int(np.clip(round(np.sqrt(np.prod(film.crop_size()) / CAMERA_CELLS)), 4, 16))
+    pixels = int(np.clip(round(np.sqrt(int(dr.prod(film.crop_size())) / CAMERA_CELLS)), 4, 16))
     lower, upper, cells = [], [], []
     for axis, (first, last), size in (
         (0, (x / z)[[0, 1]], film.crop_size()[0]),
