@@ -25,6 +25,8 @@ EXTRAS = {
     "nbclient",
     "pymovements",
     "eyedentify3d",
+    "gazeaudit",
+    "viser",
 }
 OURS = {"nerg_mi", "tests", "tools", *(p.stem for p in (ROOT / "benchmarks").glob("*.py"))}
 

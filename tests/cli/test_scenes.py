@@ -185,7 +185,7 @@ def test_a_tile_beyond_the_memory_limit_is_reported(tmp_path, nerg):
 def test_help_names_every_kind_of_figure_and_its_options(nerg):
     said = nerg("draw", "--help").out
     figures = [row for name, row in ROWS.items() if name.startswith("draw ")]
-    assert len(figures) == 7 and all(row.name.split()[1] in said and row.line in said for row in figures)
+    assert len(figures) == 8 and all(row.name.split()[1] in said and row.line in said for row in figures)
     said = nerg("draw", "sphere", "--help").out
     assert all(flag in said for flag in ("--projection", "--vmax", "--cmap", "-D", "--output", "--width"))
     assert "-D" not in nerg("draw", "sheet", "--help").out
