@@ -29,7 +29,7 @@ from .table import ROWS, TABLE, Row
 GROUPS = {
     "rays": "Import tracking files as gaze rays, and check, filter, split and plot them.",
     "train": "Train a radiance field on posed photos, or a gaze field on gaze rays.",
-    "draw": "Draw a figure: a gaze sphere, occlusion, a floor plan, a contact sheet, a difference, a baked surface.",
+    "draw": "Draw a figure: a sphere, occlusion, a floor plan, a flat area, images on a page, a difference, a surface.",
     "eval": "Score a radiance field on held-out views, or a gaze field on held-out rays.",
     "export": "Export a radiance field as a mesh, points, Gaussian splats, grid volumes or a torch-ngp checkpoint.",
 }

@@ -202,7 +202,7 @@ TABLE = (
     Row(
         "draw area",
         "nerg_mi.aoi.flat:draw_area",
-        "Draw the gaze on a flat area from its front, and write its coordinates there.",
+        "Draw the gaze on a flat area from its front, with a table.",
         ("inputs",),
         _FIGURE,
         (".png", ".svg", ".pdf", ".csv"),
