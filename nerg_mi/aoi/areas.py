@@ -441,6 +441,9 @@ def _parse_non_box(entry: AreaEntry, path: Path) -> list[Area]:
     if not isinstance(name, str):
         raise NergError(f'an area without "adt" needs a name, as in {_READING_EXAMPLE}')
     check_area_name(name)
+    kinds = [key for key in ("mesh", "shape", "parts", "min", "max") if key in definition]
+    if len(kinds) > 1:
+        raise NergError(f'the area "{sanitize(name, 40)}" has the keys {", ".join(kinds)}, of which only one is read')
     if "mesh" in definition:
         faces = None if definition.get("faces") is None else _parse_ranges(definition["faces"])
         if isinstance(definition["mesh"], MeshFile):

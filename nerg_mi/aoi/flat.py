@@ -42,7 +42,7 @@ from nerg_mi.tracking.objects import ObjectPoses
 from nerg_mi.tracking.rays import Rays
 from nerg_mi.transport.mitsuba_mesh import read_triangles
 
-from .areas import AnyAreas, Areas
+from .areas import AnyAreas, AreaGroup, Areas
 from .moving import MovingAreas, check_objects, place_objects
 from .placed import PlacedAreas, ShapeAoi, open_placed_areas
 from .statistics import open_inputs
@@ -96,9 +96,9 @@ class FlatArea:
 
     @classmethod
     def from_points(
-        cls, name: str, points: np.ndarray, axes: np.ndarray, observers: np.ndarray, up: np.ndarray
+        cls, name: str, points: np.ndarray, axes: np.ndarray, observers: np.ndarray, up: np.ndarray, is_back: bool
     ) -> FlatArea:
-        """Return the rectangle that encloses a flat area, on the side of most observers.
+        """Return the rectangle that encloses a flat area, on the side of most observers or, ``is_back``, on the other.
 
         Parameters
         ----------
@@ -120,7 +120,7 @@ class FlatArea:
         """
         center, observer = points.mean(axis=0), np.median(observers, axis=0)
         normal = np.linalg.eigh(np.cov(points.T))[1][:, 0]
-        normal = normal if np.median((observers - center) @ normal) > 0 else -normal
+        normal = normal if (np.median((observers - center) @ normal) > 0) != is_back else -normal
         upward = center - observer if abs(normal @ up) > _LEVEL else up
         upward = upward - (upward @ normal) * normal
         candidates = np.concatenate([axes, -axes])
@@ -329,11 +329,12 @@ def draw_area(
         if corners is None:
             elements = _find_elements(placed.areas, area)
             view, is_present = _view_at_rest(placed, moving, rays, elements)
-            flat = _fit_area(placed, elements, view[0][is_present])
+            sides = [_fit_area(placed, elements, view[0][is_present], is_back) for is_back in (False, True)]
         else:
-            flat, settings["corners"] = FlatArea.from_corners(corners), np.asarray(corners).tolist()
+            sides, settings["corners"] = [FlatArea.from_corners(corners)], np.asarray(corners).tolist()
             view, is_present = _view_at_rest(placed, None, rays, ())
-        samples = _list_samples(placed, moving, rays, flat, view, is_present)
+        listed = [(flat, _list_samples(placed, moving, rays, flat, view, is_present)) for flat in sides]
+        flat, samples = max(listed, key=lambda side: np.sum(side[1]["occluded"] != 1))
         shape = flat.count_pixels(resolution)
         scale = np.array(shape[::-1]) / flat.size * placed.scale  # pixels per metre
         samples |= {f"{axis}_px": samples[axis] * scale[k] for k, axis in enumerate("xy")}
@@ -341,7 +342,7 @@ def draw_area(
         if not is_seen.any():
             raise NergError(
                 f"no sample is on the area: of {len(rays):,}, {len(is_seen):,} meet it from the front, and these are "
-                "occluded; check the alignment, and the order of corners"
+                "occluded; check the alignment, and the corners or the thickness of the area"
             )
         reporter.progress(0.5, "rendering the area")
         color = _render_front(placed.environment, flat, shape)
@@ -369,6 +370,8 @@ def _find_elements(areas: Areas, name: str | None) -> tuple[int, ...]:
     if name is None or name not in members:
         what = f"there are {len(members)} areas" if name is None else f'there is no area "{sanitize(name, 40)}"'
         raise NergError(f"{what}; choose one with {parameter('area')}: {', '.join(list(members)[:20])}")
+    if name in {area.name for area in areas.areas if isinstance(area, AreaGroup)}:
+        raise NergError(f'"{sanitize(name, 40)}" is a group, with gaps between its areas; choose one of them')
     return members[name]
 
 
@@ -391,8 +394,9 @@ def _view_at_rest(
     return (o, d), np.ones(len(rays), bool)
 
 
-def _fit_area(placed: PlacedAreas, elements: tuple[int, ...], observers: np.ndarray) -> FlatArea:
-    """Return the rectangle around these elementary AOIs on the side of ``observers`` (N, 3). Raises `NergError`."""
+def _fit_area(placed: PlacedAreas, elements: tuple[int, ...], observers: np.ndarray, is_back: bool = False) -> FlatArea:
+    """Return the rectangle around these elementary AOIs on the side of ``observers`` (N, 3), or on the other. Raises
+    `NergError`."""
     points, axes = [], placed.environment.directions_to_field(np.eye(3))
     for k in elements:
         element, aoi = placed.areas.elements[k], placed.aois[k]
@@ -403,7 +407,9 @@ def _fit_area(placed: PlacedAreas, elements: tuple[int, ...], observers: np.ndar
             assert isinstance(aoi, ShapeAoi)
             points.append(_read_corners(aoi))
     up = placed.environment.directions_to_field(np.array([0.0, 0, 1]))
-    return FlatArea.from_points(placed.areas.elements[elements[0]].name, np.concatenate(points), axes, observers, up)
+    return FlatArea.from_points(
+        placed.areas.elements[elements[0]].name, np.concatenate(points), axes, observers, up, is_back
+    )
 
 
 def _read_corners(aoi: ShapeAoi) -> np.ndarray:

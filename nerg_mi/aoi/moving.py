@@ -260,13 +260,14 @@ def check_objects(moving: MovingAreas, blocks: Iterable[Rays], reporter: Reporte
             f"no sample ({count:,}, t {first:g} to {last:g} s) has a pose of an object ({poses.describe_times()}); "
             f"check the clocks and the participants: {together}"
         )
-    reporter.message(f"poses of objects are {poses.describe_times()}, samples t {first:g} to {last:g} s; {together}")
+    note = f"; {together}" if offset else ""
+    reporter.message(f"poses of objects are {poses.describe_times()}, samples t {first:g} to {last:g} s{note}")
     for name, number in unknown.items():
         if number:
             reporter.warn(
-                f'the pose of the object "{sanitize(name, 40)}" is unknown for {number:,} of {count:,} samples, which '
-                f"see no such object: gaps above {poses.max_gap:g} s ({parameter('pose_gap')}), or before its first or "
-                "after its last pose"
+                f'the pose of the object "{sanitize(name, 40)}" is unknown for {number:,} of {count:,} samples, in '
+                f"which it counts as absent: gaps above {poses.max_gap:g} s ({parameter('pose_gap')}), or before its "
+                "first or after its last pose"
             )
     if outside := int(((times < first) | (times > last)).sum()):
         reporter.message(f"{outside:,} of {len(times):,} poses of objects are outside of the recording")

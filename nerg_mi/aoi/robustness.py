@@ -502,6 +502,7 @@ def robustness(
         else:
             assert chosen.rays is not None
             gaze_fields, base = [], Analyses(placed, open_rays(chosen.rays), counting)
+            counting.disturbance.check_participants(base.rays.persons, reporter)
         for note in placed.warnings:
             reporter.message(note)
         choices = _adapt_choices(choices, base, align, reporter)

@@ -415,6 +415,8 @@ class AttentionAnalysis:
             raise NergError(f"{parameter('objects')} are poses at the times of rays; give rays")
         if self.rays is None and self.placed.sampler is None:
             raise NergError("there are no observers: give rays or a gaze field")
+        if self.rays is not None:
+            self.counting.disturbance.check_participants(self.rays.persons, self.reporter)
 
     def measure(self, num_viewpoints: int, observers: np.ndarray | None, grid: ObserverGrid) -> MeasuredAttention:
         """Count visits, and predict the attention from recorded positions or those of observers."""
@@ -569,14 +571,6 @@ class AttentionAnalysis:
                     of_cell = aggregate_by_participant(level, attention.viewpoints, cell, times, duration)
                     if of_cell is not None:
                         people.setdefault(cell, {}).setdefault(PREDICTED, []).append(of_cell)
-        tracked = [] if attention.sums is None else attention.sums.find_participants(ALL)[1]
-        missing = [p for p in tracked if p not in disturbance.by_participant]
-        if disturbance.by_participant and missing:
-            self.reporter.warn(
-                f'{len(missing):,} participants, such as "{sanitize(missing[0], 40)}", are not in the table of '
-                f"{parameter('validation')}; their accuracy is taken as {error.accuracy:g} and their precision as "
-                f"{error.precision:g} degrees"
-            )
         names = self.placed.areas.names
         corrected = tracker_rows(names, people, self.suppression, resamples=self.resamples, seed=self.seed)
         too_small = resolution_rows(self.placed, attention.viewpoints.positions, disturbance.mean_accuracy)

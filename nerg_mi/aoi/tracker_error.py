@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any
@@ -11,6 +11,9 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.environment.sampler import DirectionQuery
+from nerg_mi.errors import NergError, parameter, sanitize
+from nerg_mi.files.values import to_name
+from nerg_mi.progress import Reporter
 from nerg_mi.tracking.event_settings import EventRules
 from nerg_mi.tracking.events import label_fixations
 from nerg_mi.tracking.rays import Rays
@@ -61,6 +64,24 @@ class Disturbance:
         """Standard deviation along an axis, in radians, of the error of a sample of any participant."""
         accuracy, precision = np.radians(self._errors()).T
         return float(np.sqrt(np.mean((OFFSET_SCALE * accuracy) ** 2 + (NOISE_SCALE * precision) ** 2)))
+
+    def check_participants(self, names: Iterable[str], reporter: Reporter) -> None:
+        """Report which participants of a recording no table of validations has. Raises `NergError` if it has none."""
+        tracked = sorted(map(to_name, names))
+        missing = [name for name in tracked if name not in self.by_participant]
+        if not self.by_participant or not missing:
+            return
+        if len(missing) == len(tracked):
+            theirs, ours = (", ".join(sanitize(n, 40) for n in part[:5]) for part in ([*self.by_participant], tracked))
+            raise NergError(
+                f"no participant of the recording is in the table of {parameter('validation')}, which has {theirs}; "
+                f"the recording has {ours}: write these names into the table"
+            )
+        reporter.warn(
+            f'{len(missing):,} participants, such as "{sanitize(missing[0], 40)}", are not in the table of '
+            f"{parameter('validation')}; their accuracy is taken as {self.error.accuracy:g} and their precision as "
+            f"{self.error.precision:g} degrees"
+        )
 
     def _errors(self) -> list[tuple[float, float]]:
         """Return accuracy and precision of all validations, or those of ``error`` without any."""

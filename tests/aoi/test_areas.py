@@ -197,6 +197,8 @@ NO_AREAS = [
     [{"parts": ["a"]}],
     [BOX, {"name": "shelf", "shape": "x"}],
     [{"name": "s", "shape": 3}],
+    [{"name": "s", "shape": "x", "mesh": "m.ply"}],
+    [BOX | {"shape": "x"}],
     [{"name": "s", "shape": ""}],
     [{"name": "a\n", "shape": "x"}],
     [{"name": "m", "mesh": 3}],

@@ -13,7 +13,7 @@ from nerg_mi.aoi.flat import FlatArea, draw_area, sum_kernels
 from nerg_mi.errors import NergError
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.tracking.objects import ObjectPoses
-from nerg_mi.tracking.rays import Rays
+from nerg_mi.tracking.rays import Rays, merge_rays
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -174,6 +174,22 @@ def test_rectangles_are_found():
         fit([[0, 0, 0], [1, 1, 1]], [5, 0, 1])
     with pytest.raises(NergError):
         fit({"shape": "a"}, [5, 0, 1], {"a": {"type": "sphere"}})
+
+
+def test_the_front_is_the_side_that_is_seen():
+    rays, _ = look()
+    # More people walk behind the wall at whose front the others look.
+    eyes = np.tile([8.0, 1.2, 1.5], (1000, 1))
+    crowd = Rays.from_arrays(eyes, eyes - [0, 1, 0], times=np.arange(1000) / 50, participants=["cy"] * 1000)
+    box, wall = [[3, 0.4, 0.9], [3.02, 2, 1.8]], cube(np.array([[3.02, -5, 0], [3.2, 7, 3]]))
+    gaze = draw_area([merge_rays([rays, crowd]), {"wall": wall}], aois={"a": box}, resolution=32)
+    assert len(gaze.samples["t"]) == len(rays) and not gaze.samples["occluded"].any()
+
+
+def test_groups_are_refused():
+    aois = {"a": [[3, 0.4, 0.9], [3.1, 1, 1.8]], "b": [[3, 1.4, 0.9], [3.1, 2, 1.8]], "both": {"parts": ["a", "b"]}}
+    with pytest.raises(NergError):
+        draw_area(look()[0], aois=aois, area="both", resolution=32)
 
 
 def test_corners_are_those_of_a_rectangle():

@@ -356,8 +356,8 @@ def test_clocks_and_gaps_are_options():
     assert {"pose_gap": 0.5, "clock_offset": 7.0}.items() <= result.provenance.settings.items()
     # Samples and poses start together without an offset.
     off = statistics([people(), room()], AREAS, objects=made.shift(1.25), progress=recorder, **FREE)
-    reported = [text for text in recorder.messages if "clock_offset" in text]
-    assert off.aois != expected.aois and "-1.25 s" in reported[-1] and "by 0 s" in reported[0]
+    (reported,) = [text for text in recorder.messages if "clock_offset" in text]
+    assert off.aois != expected.aois and "-1.25 s" in reported
     with pytest.raises(NergError, match="objects"):
         statistics([people(), room()], AREAS, clock_offset=1.0)
 

@@ -7,10 +7,12 @@ from statistics import NormalDist
 import numpy as np
 import pytest
 
+from nerg_mi.aoi.robustness import robustness
 from nerg_mi.aoi.settings import AoiSampling, TrackerError, VisitRules
 from nerg_mi.aoi.statistics import statistics
 from nerg_mi.aoi.tracker_error import Disturbance, disturb_query, turn_directions
 from nerg_mi.aoi.validations import Validation, read_validation
+from nerg_mi.errors import NergError
 from nerg_mi.tracking.rays import Rays
 from tests.aoi.place import people, write_place
 from tests.recorder import Recorder
@@ -204,6 +206,17 @@ def test_a_table_replaces_the_error_of_participants(tmp_path):
     recorder = Recorder()
     result = statistics(rays, EDGE, rules=RULES, validation=file, resamples=199, progress=recorder)
     assert result.tracker and any('"p0000"' in text for text in recorder.warnings)
+    recorder = Recorder()
+    robustness(rays, EDGE, rules=RULES, validation=file, analyses=10, progress=recorder)
+    assert any('"p0000"' in text for text in recorder.warnings)
+
+
+@pytest.mark.parametrize("analyse", [statistics, robustness])
+def test_a_table_of_other_participants_is_refused(tmp_path, analyse):
+    file = tmp_path / "validation.csv"
+    file.write_text("participant,accuracy,precision\nann,3,0\n")
+    with pytest.raises(NergError, match="p0001"):
+        analyse(look(np.zeros((2, 4))), EDGE, rules=RULES, validation=file, resamples=199, progress=False)
 
 
 def test_a_session_has_the_nearest_validation():
