@@ -31,7 +31,7 @@ class Panel:
         """Open the folder ``title`` unless the control ``inside`` is visible, and wait until it is."""
         if not self._seen(inside):
             self._click(self._one(f"//*[normalize-space(text())='{title}']"))
-            end = time.monotonic() + 10
+            end = time.monotonic() + 60
             while not self._seen(inside):
                 assert time.monotonic() < end, f"{title} does not unfold"
                 time.sleep(0.1)
