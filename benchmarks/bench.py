@@ -5,7 +5,7 @@
 
 The parts are:
 
-- ``frames``: a frame of the demo store, compared with a renderer in PyTorch;
+- ``frames``: a frame of the demo store, compared with a renderer in PyTorch (``frames-avx2`` without AVX-512);
 - ``stages``: the stages of that frame;
 - ``threads``: that frame on 1, 2, 4, ... threads;
 - ``kde``: kernel densities on the sphere, compared with SciPy;
@@ -38,6 +38,7 @@ from nerg_mi.scenes.store import SCENE_FILE
 from timing import at_the_end, exponent, in_turns, median, save_result, spread
 
 import numpy as np
+from tools.other_processor import has_avx512
 
 Works = dict[str, Callable[[], np.ndarray]]
 
@@ -215,7 +216,8 @@ def frames(run: Run) -> None:
         rows += torch_frames.measure(works, f"{width} x {height}", runs)
     titles = {"frame": "image size", "s": "time, s", "quartiles": "quartiles, s", "CPU s": "CPU time, s"}
     titles["times nerg"] = "relative to nerg"
-    run.save("frames", [titles.get(key, key) for key in rows[0]], [list(map(str, r.values())) for r in rows])
+    name = "frames" if run.cuda or has_avx512() else "frames-avx2"
+    run.save(name, [titles.get(key, key) for key in rows[0]], [list(map(str, r.values())) for r in rows])
 
 
 def stages(run: Run) -> None:

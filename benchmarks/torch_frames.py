@@ -36,7 +36,6 @@ from timing import in_turns, median, spread
 from torch_radiance import _PRIMES, TorchModel, harmonics
 
 import numpy as np
-from tools.other_processor import limit_drjit
 
 
 class Attention:
@@ -280,12 +279,10 @@ PEER_SCENE = {"reaimed_hits": False}
 
 class Ours:
     """A function that renders frames of the demo store with these ``values`` of its scene; ``constant``: with constant
-    weights of its networks; ``moves``: of an observer at another position in each frame; ``has_avx2``: with kernels
-    of AVX2, as on processors without AVX-512. ``first``: seconds of the first frame, with compilation."""
+    weights of its networks; ``moves``: of an observer at another position in each frame. ``first``: seconds of the
+    first frame, with compilation."""
 
-    def __init__(
-        self, values: dict, visibility: str, constant: bool = False, moves: bool = False, has_avx2: bool = False
-    ):
+    def __init__(self, values: dict, visibility: str, constant: bool = False, moves: bool = False):
         import mitsuba as mi
 
         scene = nerg.Scene.load(SCENE_FILE, **{**PEER_SCENE, **values}, visibility=visibility)
@@ -293,7 +290,6 @@ class Ours:
             scene.set_constant_weights()
         self.render = partial(nerg.render_tensor, scene, spp=1)
         self.params, self.moves, self.frames = mi.traverse(scene.integrator), moves, 0
-        self.has_avx2 = has_avx2
         start = time.perf_counter()
         self()
         self.first = time.perf_counter() - start
@@ -309,13 +305,7 @@ class Ours:
             eye = mi.ScalarPoint3f(4.4, 2.8 + 0.002 * self.frames, 1.6)
             self.params["observer.to_world"] = mi.Transform4f().look_at(eye, [4.8, 4.4, 1.2], [0, 0, 1])
             self.params.update()
-        if not self.has_avx2:
-            return np.array(self.render())
-        undo = limit_drjit(8)
-        try:
-            return np.array(self.render())
-        finally:
-            undo()
+        return np.array(self.render())
 
 
 def our_frames(values: dict, compiled: Path) -> dict[str, Ours]:
@@ -324,7 +314,6 @@ def our_frames(values: dict, compiled: Path) -> dict[str, Ours]:
     Those with constant weights give bit-identical images, and those of the compiled field images of at least 40 dB,
     which is checked.
     """
-    import mitsuba as mi
 
     frames, names = {}, (("", "depth"), (", same observer again", "map"))
     for field, changed in (("nerg", {}), ("nerg, compiled field", {"field": str(compiled)})):
@@ -335,9 +324,6 @@ def our_frames(values: dict, compiled: Path) -> dict[str, Ours]:
             if not np.array_equal(frames[field + name](), frames[f"{field}{name}, constant weights"]()):
                 raise SystemExit("constant weights give another picture")
         frames[f"{field}, observer moves"] = Ours({**values, **changed}, "depth", moves=True)
-    for name, visibility in names if mi.variant().startswith("llvm") else ():
-        changed = {**values, "field": str(compiled)}
-        frames[f"nerg, compiled field{name}, AVX2"] = Ours(changed, visibility, has_avx2=True)
     ours, other = (np.clip(frames[name]()[..., :3], 0, 1) for name in ("nerg", "nerg, compiled field"))
     if not np.mean((ours - other) ** 2) < 1e-4:
         raise SystemExit("the compiled field gives another picture")

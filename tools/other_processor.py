@@ -4,8 +4,7 @@
 
 NumPy, OpenBLAS and Dr.Jit select instructions by the processor, and results differ in their last bits. Here, they
 select those of a processor without AVX-512 or, where there is none, without AVX2. NumPy and OpenBLAS read this from the
-environment, also in child processes. Dr.Jit does not: `limit_drjit`, which tests and benchmarks call, changes its
-process only.
+environment, also in child processes. Dr.Jit does not: `limit_drjit`, which tests call, changes its process only.
 """
 
 from __future__ import annotations
@@ -22,13 +21,25 @@ VARIABLE = "NERG_VECTOR_WIDTH"
 """Environment variable with the number of floats in a vector of Dr.Jit's kernels."""
 
 
-def make_environment() -> dict[str, str]:
-    """Return environment variables for the next narrower kind of processor."""
+AVX512 = ("AVX512", "X86_V4")
+"""Prefixes of NumPy's names for AVX-512."""
+
+
+def _list_extensions() -> list[str]:
+    """Return the instructions that NumPy uses on this processor in addition to those that its build requires."""
     import numpy as np
 
-    # The instructions that this build of NumPy uses on this processor in addition to those that it requires.
-    extra = np.show_config(mode="dicts")["SIMD Extensions"].get("found", [])
-    widest = [name for name in extra if name.startswith(("AVX512", "X86_V4"))]
+    return np.show_config(mode="dicts")["SIMD Extensions"].get("found", [])
+
+
+def has_avx512() -> bool:
+    return any(name.startswith(AVX512) for name in _list_extensions())
+
+
+def make_environment() -> dict[str, str]:
+    """Return environment variables for the next narrower kind of processor."""
+    extra = _list_extensions()
+    widest = [name for name in extra if name.startswith(AVX512)]
     return {
         "NPY_DISABLE_CPU_FEATURES": " ".join(widest or extra),
         "OPENBLAS_CORETYPE": "Haswell" if widest else "Nehalem",

@@ -35,7 +35,7 @@ FIXED = set("-o --output --mode --variant --store --scheduler --help --threads".
 """Options that are not varied: outputs, variants, and where work is done."""
 
 _WORK = "steps minutes spp resamples resolution ensemble width height texture-size max-angle max-edge cone scale fps"
-_WORK += " views viewpoints num-rays num-views num-frames repeats folds rays gaze"
+_WORK += " views viewpoints num-rays num-views num-frames repeats folds rays gaze analyses"
 WORK = {"--" + name for name in _WORK.split()}
 """Options whose value is an amount of work: any in their range may be meant in earnest, and take hours. A line with one
 is interrupted after `PATIENCE` seconds of the processor, and must end then; others must be done within `LIMIT`."""
