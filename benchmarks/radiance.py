@@ -1,12 +1,10 @@
 """Radiance fields trained on photos: PSNR, SSIM and depth of held-out views, rendered by the integrator.
 
-    python benchmarks/radiance.py fox [--minutes 1,2,4,7,10 | --steps 9000] [--width 135] [--deferred] [--validate]
-        [--set lr_hold_fraction=0.5]
+    python benchmarks/radiance.py fox [--minutes 1,2,4,7,10 | --steps 9000] [--width 135] [--size medium]
     python -m nerg_mi.scenes.store.make --stage views          # once: images of the store, rendered from the twin
-    python benchmarks/radiance.py store [--minutes 10 | --steps 15000] [--size medium] [--only images|depth]
+    python benchmarks/radiance.py store [--minutes 10 | --steps 15000] [--size medium]
     python -m nerg_mi.scenes.tabletop.make                     # once: photos, rendered from a generated scene
-    python benchmarks/radiance.py tabletop [--minutes 4 | --steps 6000] [--bounded]
-    python benchmarks/radiance.py captures --data FOLDER [--minutes 2,10 | --steps 1000] [--width 240]
+    python benchmarks/radiance.py tabletop [--minutes 4 | --steps 6000]
 
 ``fox``: real photos, of which every 8th is held out. There is one training, for the last of the ``--minutes`` or for
 ``--steps``, whose learning-rate schedule covers the whole time. After each of the ``--minutes``, the clock stops and
@@ -22,24 +20,17 @@ the walls are compared with exact ray casts at the store's mesh.
 defaults of `nerg train radiance`. The photos are read as a COLMAP model, with every 8th photo held out and the box
 determined from its points. Depth is compared with exact ray casts. "Near" is within 1.5 m of the object. "Far" is more
 than 4 m from the camera, without the sky. "Beyond" is outside of the field's box, or of the core of a contracted field,
-with the sky.
+with the sky. The first training treats the scene as if nothing were visible beyond the box.
 
-``captures``: each posed image set in the folder ``--data``, with the defaults of `nerg train radiance`: one training
-for each of the ``--minutes``, or of ``--steps``, whose best state is scored on at most eight held-out views that did
-not choose it. "Fall" is the PSNR of the best evaluation on the views that did minus that of the result. Default
-settings were chosen with held-out views of most of these captures (fox and store: with ``--validate``), so that a new
-capture may have lower scores.
-
-Each training saves a result.
+Each saves a result.
 """
 
 from __future__ import annotations
 
 import argparse
-import ast
 import os
 from collections.abc import Iterator
-from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
@@ -66,15 +57,13 @@ SCORES = {
 """Key of a row -> its title in the table."""
 
 
-def open_views(folder: Path, args: argparse.Namespace, width: int | None = None):
-    """The data set of ``folder``; with ``--validate`` every 8th training view replaces the held-out ones."""
+def open_views(folder: Path, width: int | None = None):
+    """The data set of ``folder``."""
     from nerg_mi.photos.dataset import open_dataset
 
     if not folder.exists():
         raise SystemExit(f"{folder} does not exist; give a posed image set with --data, or make it (--help)")
     data = open_dataset(folder, None, width)
-    if args.validate:
-        data = replace(data, held_out=data.train[::8], train=[v for k, v in enumerate(data.train) if k % 8])
     print(f"{len(data.train)} views to train on, {len(data.held_out)} to score; load {os.getloadavg()[0]:.1f}")
     return data
 
@@ -86,12 +75,7 @@ def make_lengths(args: argparse.Namespace) -> list[dict[str, float]]:
     return [{"minutes": minutes} for minutes in sorted(float(m) for m in args.minutes.split(","))]
 
 
-def make_settings(args: argparse.Namespace) -> dict:
-    """The keyword arguments of ``--set``."""
-    return {key: ast.literal_eval(value) for key, value in (pair.split("=", 1) for pair in args.set)}
-
-
-def fields(data, args: argparse.Namespace, name: str, depth: bool, deferred=False) -> Iterator:
+def fields(data, args: argparse.Namespace, name: str, depth: bool) -> Iterator:
     """Train once; yields ``(trainer, path, row)`` after each of `make_lengths`, with the current field in a file whose
     name starts with ``name``."""
     from nerg_mi.cli.declarations import select_backend
@@ -103,8 +87,8 @@ def fields(data, args: argparse.Namespace, name: str, depth: bool, deferred=Fals
 
     select_backend("llvm_ad_rgb", args.threads)
     ns = namespace("llvm_ad_rgb")
-    settings = RadianceSettings(seed=args.seed, **make_lengths(args)[-1], **make_settings(args))
-    config = replace(make_radiance_config(args.size, data.box), deferred=deferred)
+    settings = RadianceSettings(seed=args.seed, **make_lengths(args)[-1])
+    config = make_radiance_config(args.size, data.box)
     trainer = RadianceTrainer(data.train, data.box, config, settings, ns, depth=depth)
     warm_up(trainer)
     for length in make_lengths(args):
@@ -140,9 +124,9 @@ def fox(args: argparse.Namespace) -> tuple[list[str], list[list[str]]]:
     """Header and cells of the table."""
     from nerg_mi.train.radiance_run import evaluate_views
 
-    data = open_views(args.data, args, args.width)
+    data = open_views(args.data, args.width)
     rows = []
-    for trainer, path, row in fields(data, args, f"fox_{args.width}", False, args.deferred):
+    for trainer, path, row in fields(data, args, f"fox_{args.width}", False):
         rows.append(row | {"training views, dB": evaluate_views(trainer, data.train[::8], 2).mean, "file": path})
     for row in rows:
         row |= scored(row["file"], data.held_out, args.spp)[1]
@@ -151,8 +135,8 @@ def fox(args: argparse.Namespace) -> tuple[list[str], list[list[str]]]:
 
 
 def store(args: argparse.Namespace) -> tuple[list[str], list[list[str]]]:
-    data, table = open_views(args.data, args), []
-    for source in ("images", "depth") if args.only is None else (args.only,):
+    data, table = open_views(args.data), []
+    for source in ("images", "depth"):
         for _, path, row in fields(data, args, source, source == "depth"):
             scores, columns = scored(path, data.held_out, args.spp)
             depth = scores.depth
@@ -174,11 +158,10 @@ def tabletop(args: argparse.Namespace) -> tuple[list[str], list[list[str]]]:
         raise SystemExit(f"{args.data} holds no photos; make them with: python -m nerg_mi.scenes.tabletop.make")
     held_out = open_dataset(args.data / DEPTH_FILE).held_out
     table = []
-    for length in make_lengths(args):
-        path = args.out / f"tabletop_{next(iter(length.values())):g}.safetensors"
-        unbounded = False if args.bounded else None
+    for length, unbounded in product(make_lengths(args), (False, None)):
+        path = args.out / f"tabletop_{next(iter(length.values())):g}_{unbounded}.safetensors"
         select_backend("llvm_ad_rgb", args.threads)
-        settings = RadianceSettings(**length, **make_settings(args))
+        settings = RadianceSettings(**length)
         result = train_radiance(args.data, unbounded=unbounded, seed=args.seed, settings=settings, output=path)
         metadata, box = result.provenance, result.network.box.core
         if [v.name.rpartition("/")[2] for v in held_out] != metadata["held_out"]["frames"]:
@@ -196,45 +179,6 @@ def tabletop(args: argparse.Namespace) -> tuple[list[str], list[list[str]]]:
     head = ["training time, min", "steps", "PSNR, dB", "SSIM", "PSNR within, beyond, dB"]
     head += ["pixels beyond", *(f"{name}: median depth error, outliers" for name in ("near", "far")), "box"]
     return head, table
-
-
-def captures(args: argparse.Namespace) -> tuple[list[str], list[list[str]]]:
-    from nerg_mi.cli.declarations import select_backend
-    from nerg_mi.photos.dataset import open_dataset
-    from nerg_mi.photos.images import pick_evenly
-    from nerg_mi.train.radiance import train_radiance
-    from nerg_mi.train.radiance_settings import RadianceSettings
-
-    rows = []
-    for folder in sorted(p for p in args.data.iterdir() if p.is_dir()):
-        width = min(args.width, *(view.shape[1] for view in open_dataset(folder).train))
-        for length in make_lengths(args):
-            path = args.out / f"{folder.name}_{next(iter(length.values())):g}.safetensors"
-            select_backend("llvm_ad_rgb", args.threads)
-            settings = RadianceSettings(**length, **make_settings(args))
-            options = {"width": width, "size": args.size, "seed": args.seed, "settings": settings}
-            made = train_radiance(folder, **options, output=path).provenance
-            validation = made["validation_views"]
-            others = [v for v in open_dataset(folder, width=width).held_out if v.name not in validation]
-            held_out = pick_evenly(others, 8)
-            watched, result = made["psnr_watched"]["history"], made["psnr_watched"]["result"]
-            row = {"capture": folder.name, "photos": made["training_frames"], "minutes": made["seconds"] / 60}
-            row |= {"steps": made["steps"], **scored(path, held_out, args.spp)[1], "train": result["psnr_train"]}
-            row |= {"fall": max(r["psnr"] for r in watched) - result["psnr"], "result step": result["steps"]}
-            rows.append(row | {"quality": made["quality"], "load": os.getloadavg()[0]})
-            print(rows[-1], flush=True)
-    titles = {
-        "capture": "capture",
-        "photos": "training photos",
-        "minutes": "training time, min",
-        "steps": "steps",
-        **{key: SCORES[key] for key in ("PSNR, dB", "fitted, dB", "SSIM")},
-        "train": "PSNR of training views, dB",
-        "fall": "fall, dB",
-        "quality": "quality",
-    }
-    formats = ("", "d", ".1f", ",", ".2f", ".2f", ".3f", ".1f", ".2f", "")
-    return list(titles.values()), [[f"{row[key]:{f}}" for key, f in zip(titles, formats)] for row in rows]
 
 
 def score_depths(field: Path, views: list, box, center, spp: int, pictures: Path) -> dict[str, float]:
@@ -278,7 +222,6 @@ SETS = {
     "fox": (fox, FOX, "1,2,4,7,10"),
     "store": (store, ROOT / "scenes" / "store" / "build", "10"),
     "tabletop": (tabletop, ROOT / "scenes" / "tabletop" / "build", "4"),
-    "captures": (captures, Path("captures"), "2,10"),
 }
 """Training and scoring functions, the folder of the views, and the minutes, by name."""
 
@@ -296,44 +239,15 @@ def main(argv=None) -> None:
     parser.add_argument(
         "--minutes",
         help="Training time in minutes, or several, separated by commas: times in one training at which the field is "
-        "scored (fox, store), or lengths of several trainings (tabletop, captures). Default: 1,2,4,7,10 (fox), 10 "
-        "(store), 4 (tabletop), 2,10 (captures).",
+        "scored (fox, store), or lengths of several trainings (tabletop). Default: 1,2,4,7,10 (fox), 10 (store), 4 "
+        "(tabletop).",
     )
     parser.add_argument("--steps", type=int, help="Number of training steps in place of --minutes.")
     parser.add_argument(
-        "--width", type=int, default=135, help="Width of the photos in pixels (fox, captures). Default: %(default)s."
+        "--width", type=int, default=135, help="Width of the photos in pixels (fox). Default: %(default)s."
     )
     parser.add_argument(
-        "--size",
-        default="small",
-        help="Size of the field: small, medium or paper (fox, store, captures). Default: %(default)s.",
-    )
-    parser.add_argument(
-        "--deferred", action="store_true", help="Evaluate the colour network once per ray, not per sample (fox)."
-    )
-    parser.add_argument(
-        "--only",
-        choices=("images", "depth"),
-        help="Train on images alone, or on images with depth (store). Default: both.",
-    )
-    parser.add_argument(
-        "--bounded",
-        action="store_true",
-        help="Train as if nothing were visible beyond the box of the field (tabletop).",
-    )
-    parser.add_argument(
-        "--validate",
-        action="store_true",
-        help="Score every 8th training view, which is then not trained on, instead of the held-out views; for choosing "
-        "settings (fox, store).",
-    )
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="KEY=VALUE",
-        help="Value of a field of RadianceSettings (fox, store), or of an option (tabletop, captures); can be "
-        "repeated. Default: none.",
+        "--size", default="small", help="Size of the field: small, medium or paper (fox, store). Default: %(default)s."
     )
     parser.add_argument(
         "--spp",
