@@ -220,7 +220,7 @@ def test_viewer_frames_of_a_new_process(tmp_path):
 
 
 SCRIPTS = sorted(p.stem for p in (ROOT / "benchmarks").glob("*.py") if "__main__" in p.read_text(encoding="utf-8"))
-ON_PAGES = {"independent_score"}
+ON_PAGES = {"ablation", "independent_score"}
 """Benchmarks without a result, which a page names."""
 
 
