@@ -1,9 +1,12 @@
-"""The check of names in sentences finds those that do not exist, and no others."""
+"""The check of names in sentences finds those that do not exist, and no others; names of slow tests exist."""
 
 from __future__ import annotations
 
+import re
+
 import pytest
 
+from tests.conftest import ROOT, listed_as_slow
 from tools import backticks
 
 
@@ -51,3 +54,9 @@ def test02_missing_names(names, sentence, missing):
 def test03_sentences_are_docstrings_and_comments():
     file = backticks.PythonFile('"""One."""\nx = "two"  # three\n# four\n# five\ny = 1\n"""Six."""\n')
     assert sorted(file.sentences) == [(1, "One."), (2, "three"), (3, "four\nfive"), (6, "Six.")]
+
+
+def test_slow_tests_exist():
+    for entry in listed_as_slow():
+        file, _, name = entry.partition("::")
+        assert re.search(rf"^def {name}\(" if name else "", (ROOT / file).read_text(), re.M), entry
