@@ -36,10 +36,11 @@ def spell_python(name: str, value: str) -> str:
 
 
 def spell_command_line(name: str, value: str, flag: str = "") -> str:
-    """Spell a parameter as an option, by default that of its name: ``--steps 200``, ``--resume``, ``--no-depth``."""
-    flag = flag or f"--{name.replace('_', '-')}"
+    """Spell a parameter as an option, by default that of its name: ``--steps 200``, ``--resume``, ``--no-depth``; a
+    ``flag`` may have its own negative form, as ``--unbounded/--bounded``."""
+    flag, _, negative = (flag or f"--{name.replace('_', '-')}").partition("/")
     if value == "False":
-        return f"--no-{flag[2:]}"
+        return negative or f"--no-{flag[2:]}"
     return flag if value in ("", "True") else f"{flag} {value}"
 
 

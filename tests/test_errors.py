@@ -34,6 +34,13 @@ def test_texts_are_spelled_for_python_unless_told_otherwise():
     text = parameter("depth", False)
     assert clean_text(text) == "depth=False" and clean_text(text, spell_command_line) == "--no-depth"
     assert clean_text(sanitize(text)) == "depth=False"
+    assert spell_command_line("unbounded", "False", "--unbounded/--bounded") == "--bounded"
+    assert spell_command_line("unbounded", "True", "--unbounded/--bounded") == "--unbounded"
+    scene_type = parameter("unbounded", False)
+    assert clean_text(scene_type, choose_spelling(["train", "radiance"])) == "--bounded"
+    # Limits that a command has no options for are set in Python.
+    limit = parameter("max_step", 0.3)
+    assert clean_text(limit, choose_spelling(["draw", "scanpath"])) == "max_step=0.3"
     assert clean_text(parameter("columns", "t=time")) == 'columns="t=time"'
 
 

@@ -262,7 +262,7 @@ def _make_spelling(parameters: Mapping[str, inspect.Parameter], without: Sequenc
         if isinstance(info, typer.models.OptionInfo):
             # In annotations, typer stores the first spelling as the default.
             names = [f"--{name.replace('_', '-')}", info.default, *(info.param_decls or ())]
-            flags[name] = [spelling for spelling in names if isinstance(spelling, str)][-1].partition("/")[0]
+            flags[name] = [spelling for spelling in names if isinstance(spelling, str)][-1]
         else:
             flags[name] = info.metavar or name.upper()
 

@@ -76,6 +76,7 @@ def make_command(row: Row) -> Command:
         outputs[name] = extra(None, help, Path, *(spellings or [f"--{name}"]), group=OUTPUT)
     arguments |= outputs | presets
     members, settings, ranges = list[Any](), dict[str, Any](), find_ranges(function)
+    of_settings = [f.name for p in parameters.values() if is_dataclass(p.default) for f in fields(p.default)]
     headings = {name: heading for heading, names in row.groups.items() for name in names}
     for name in (name for name in kinds if name not in arguments):
         default = parameters[name].default
@@ -156,7 +157,7 @@ def make_command(row: Row) -> Command:
         " ".join(summary.split()),
         " ".join(more.split()),
         options,
-        row.without,
+        (*row.without, *(name for name in of_settings if name not in {name for name, *_ in members})),
         arguments,
         readers.view_presets if readers else None,
     )

@@ -209,7 +209,7 @@ def _report_data(data: Dataset, reporter: Reporter) -> None:
         reporter.message(line)
     reporter.message(
         f"assumed scene type: {data.kind_note}; change it with {parameter('unbounded', True)}, "
-        f"{parameter('bounded')} or {parameter('aabb')}"
+        f"{parameter('unbounded', False)} or {parameter('aabb')}"
     )
     reporter.message(f"box: ({corner(core.lower)}) to ({corner(core.upper)}), {data.box_source}")
     if points := sum(len(view.points) for view in data.train if view.points is not None):
