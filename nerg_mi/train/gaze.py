@@ -188,8 +188,8 @@ def train_gaze(
     NergError
         An argument is invalid, which is found before any time is spent where possible.
     KeyboardInterrupt
-        Ctrl-C was pressed. After the first step of the fit of a single field it is a `TrainingInterrupted`: an
-        ``output`` has been written, and its attribute ``field`` is the field so far.
+        Ctrl-C was pressed. After the first step of the fit of a single field, and until the end of its folds, it is a
+        `TrainingInterrupted`: an ``output`` has been written, and its attribute ``field`` is the field so far.
 
     Examples
     --------

@@ -183,22 +183,23 @@ def train_ensemble(
                 raise KeyboardInterrupt(f"interrupted while training member {k + 1} of {members}; {hint}")
         fields.append(field)
         provenances.append(provenance)
-    if selects_weight and selection is None:
-        selection = evaluate_folds(supervision, geometry, full_plan, ns, progress.start(fold_cost)).select()
-    if selection is not None:
-        for field in fields:
-            selection.apply_prior(field, supervision.rays, geometry, plan)
-    ensemble = GazeEnsemble(fields, supervision.make_support(plan.probes.radius, geometry))
-    if selection is not None:
-        ensemble.hits = selection.make_hits(supervision.rays, geometry, plan)
-    ensemble.basis = summarize_provenance(supervision.summarize_data())
-    provenance = _combine_provenances(provenances, plan.settings, supervision, kind) | (
-        {"mix": selection.to_dict()} if selection else {}
-    )
-    if write is not None:
-        # Every member is already in its file, so there is nothing to save if this fails.
-        with saving_on_failure(path, lambda: None, is_done=False):
+    # Every member is already in its file, so there is nothing to save if this fails.
+    with saving_on_failure(parts[0], lambda: None, is_done=False):
+        if selects_weight and selection is None:
+            selection = evaluate_folds(supervision, geometry, full_plan, ns, progress.start(fold_cost)).select()
+        if selection is not None:
+            for field in fields:
+                selection.apply_prior(field, supervision.rays, geometry, plan)
+        ensemble = GazeEnsemble(fields, supervision.make_support(plan.probes.radius, geometry))
+        if selection is not None:
+            ensemble.hits = selection.make_hits(supervision.rays, geometry, plan)
+        ensemble.basis = summarize_provenance(supervision.summarize_data())
+        provenance = _combine_provenances(provenances, plan.settings, supervision, kind) | (
+            {"mix": selection.to_dict()} if selection else {}
+        )
+        if write is not None:
             write(ensemble, provenance)
+    if write is not None:
         for part in parts:
             if part is not None:
                 part.unlink(missing_ok=True)

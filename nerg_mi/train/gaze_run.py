@@ -420,41 +420,41 @@ def fit_gaze(
         except KeyboardInterrupt:
             interrupted = True
             save()
-    field = last.trainer.make_field(last.weights)
-    if selection is not None:
-        selection.apply_prior(field, training.rays, geometry, plan)
-        field.hits = selection.make_hits(training.rays, geometry, plan)
+    with saving_on_failure(state.path, save, is_done=write is not None and not interrupted):
+        field = last.trainer.make_field(last.weights)
+        if selection is not None:
+            selection.apply_prior(field, training.rays, geometry, plan)
+            field.hits = selection.make_hits(training.rays, geometry, plan)
 
-    # Describe and store the result.
-    field.support = training.make_support(plan.probes.radius, geometry)
-    field.basis = summarize_provenance(supervision.summarize_data())
-    provenance = {
-        **{key: identity[key] for key in ("settings", "probes", "align")},
-        **supervision.summarize_data(),
-        "probes_made": len(targets.truth),
-        "escaped_directions": round(targets.miss_fraction, 6),
-        "escaped_gaze": round(targets.miss_gaze_fraction, 6),
-        "made": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-        "steps": last.trainer.steps,
-        "seconds": round(file.elapsed, 1),
-        "seconds_preparing": round(preparation_seconds, 1),
-        "refitted": is_refit,
-        "interrupted": interrupted,
-    }
-    if selection is not None:
-        provenance["mix"] = selection.to_dict()
-    if validation is not None and first.scores is not None:
-        provenance["validation"] = {
-            "zones": settings.validation_zones,
-            "probes": len(validation.truth),
-            "rays_held_out": split.rays_held_out,
-            "views_held_out": split.views_held_out,
-            "best_step": first.best_step,
-            **round_scores(first.scores),
-            "history": first.history,
+        # Describe and store the result.
+        field.support = training.make_support(plan.probes.radius, geometry)
+        field.basis = summarize_provenance(supervision.summarize_data())
+        provenance = {
+            **{key: identity[key] for key in ("settings", "probes", "align")},
+            **supervision.summarize_data(),
+            "probes_made": len(targets.truth),
+            "escaped_directions": round(targets.miss_fraction, 6),
+            "escaped_gaze": round(targets.miss_gaze_fraction, 6),
+            "made": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+            "steps": last.trainer.steps,
+            "seconds": round(file.elapsed, 1),
+            "seconds_preparing": round(preparation_seconds, 1),
+            "refitted": is_refit,
+            "interrupted": interrupted,
         }
-    if write is not None:
-        with saving_on_failure(state.path, save, is_done=not interrupted):
+        if selection is not None:
+            provenance["mix"] = selection.to_dict()
+        if validation is not None and first.scores is not None:
+            provenance["validation"] = {
+                "zones": settings.validation_zones,
+                "probes": len(validation.truth),
+                "rays_held_out": split.rays_held_out,
+                "views_held_out": split.views_held_out,
+                "best_step": first.best_step,
+                **round_scores(first.scores),
+                "history": first.history,
+            }
+        if write is not None:
             write(field, provenance)
     return field, provenance
 

@@ -12,6 +12,7 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.fields.gaze_base import DataSummary
 from nerg_mi.formats.checkpoint import write_checkpoint
+from nerg_mi.interruption import Interrupted
 from nerg_mi.tracking.rays import Rays
 from nerg_mi.train.gaze_data import Supervision
 from nerg_mi.train.gaze_ensemble import assign_blocks, resample_rays, resample_views, train_ensemble
@@ -133,6 +134,32 @@ def test_an_interrupted_ensemble_resumes(threads, tmp_path):
     expected = arrays(together()[0])
     for name, value in arrays(got).items():
         np.testing.assert_array_equal(value, expected[name], err_msg=name)
+
+
+def test_an_ensemble_interrupted_in_its_folds_resumes(threads, tmp_path):
+    """All members are kept, and the folds start again."""
+    threads(1)
+    path, stages, folded = tmp_path / "a.run", [], replace(SHORT, prior_folds=2)
+
+    def stop(state):
+        if state.stage == "fold 1":
+            raise KeyboardInterrupt
+
+    with pytest.raises(Interrupted) as end:
+        together(2, path=path, settings=folded, on_progress=stop)
+    assert "resume=True" in str(end.value) and str(tmp_path / "a.member0.safetensors") in str(end.value)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.member0.safetensors", "a.member1.safetensors"]
+    resumed, provenance = together(
+        2, path=path, resume=True, settings=folded, on_progress=lambda s: stages.append(s.stage), write=lambda *_: None
+    )
+    complete, expected = together(2, settings=folded)
+    assert set(stages) == {"fold 1", "fold 2", "folds"} and not list(tmp_path.iterdir())
+    assert provenance["mix"] == expected["mix"] and provenance["mix"]["folds"] == 2
+    for name, value in arrays(complete).items():
+        np.testing.assert_array_equal(value, arrays(resumed)[name], err_msg=name)
+    with pytest.raises(KeyboardInterrupt) as end:  # without a file there is nothing to resume
+        together(2, settings=folded, on_progress=stop)
+    assert "resume" not in str(end.value)
 
 
 @pytest.mark.parametrize(

@@ -21,13 +21,14 @@ from nerg_mi.fields.gaze_log_density import LogGazeConfig
 from nerg_mi.files.atomic import reserve_output
 from nerg_mi.formats.checkpoint import read_checkpoint
 from nerg_mi.formats.fields import load_gaze
-from nerg_mi.interruption import TrainingInterrupted
+from nerg_mi.interruption import Interrupted, TrainingInterrupted
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.threads import set_thread_count
 from nerg_mi.train import gaze as module
 from nerg_mi.train import gaze_recipes
 from nerg_mi.train.gaze import train_gaze
 from nerg_mi.train.gaze_data import compute_surface_distances
+from nerg_mi.train.gaze_folds import PriorSelection
 from nerg_mi.train.gaze_log_density import LikelihoodTrainer, get_geometry_options
 from nerg_mi.train.gaze_recipes import FieldOptions, Recipe, get_recipe, register_recipe
 from nerg_mi.train.gaze_settings import GazeSettings, ProbeSettings
@@ -255,6 +256,28 @@ def test_an_interrupted_training_stops_the_script_and_reports_how_to_resume(rays
         np.testing.assert_array_equal(value, arrays(resumed.network)[name], err_msg=name)
     with pytest.raises(NergError, match="no state to resume"):
         train_gaze(rays, "none", **options, output=out, resume=True)
+
+
+def test_a_training_interrupted_after_its_folds_resumes_to_the_same_result(tmp_path, single_thread, monkeypatch):
+    """Ctrl-C while the result is made."""
+    rays, out = crowd(), tmp_path / "gaze.safetensors"
+    options = {**FOLDED, "variant": "capture"}
+
+    def interrupt(*arguments):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(PriorSelection, "apply_prior", interrupt)
+        with pytest.raises(Interrupted, match="resume=True"):
+            train_gaze(rays, "none", **options, output=out)
+    assert {p.name for p in tmp_path.iterdir()} == {"gaze.run"}
+    assert read_checkpoint(tmp_path / "gaze.run", "gaze run")[1]["steps"] == options["steps"]
+    resumed = train_gaze(rays, "none", **options, output=out, resume=True)
+    complete = train_gaze(rays, "none", **options)
+    assert [p.name for p in tmp_path.iterdir()] == ["gaze.safetensors"]
+    assert resumed.provenance["mix"] == complete.provenance["mix"]
+    for name, value in arrays(complete.network).items():
+        np.testing.assert_array_equal(value, arrays(resumed.network)[name], err_msg=name)
 
 
 @pytest.mark.parametrize("zones", [0, 1])
