@@ -33,7 +33,7 @@ from nerg_mi.tasks.settings import Parallel
 from nerg_mi.tasks.task import Part
 from nerg_mi.tracking.dataset import open_rays, open_recordings
 from nerg_mi.tracking.event_settings import EventRules, read_fixations
-from nerg_mi.tracking.events import label_fixations, warn_unknown_tracking
+from nerg_mi.tracking.events import describe_slow_sampling, label_fixations, warn_unknown_tracking
 from nerg_mi.tracking.rays import TRACKING, Rays
 from nerg_mi.transport.observer_gaze import GazeFieldInstance
 
@@ -594,11 +594,18 @@ def _adapt_to_rays(choices: Choices, base: Analyses, reporter: Reporter) -> Choi
         reason = f"the rays are {TRACKING[rays.tracking]}"
     else:
         warn_unknown_tracking(rays.tracking, reporter.warn)
-        strictest = {"velocity": choices.velocity[0], "min_fixation": choices.min_fixation[1]}
-        label, _ = label_fixations(rays, _make_rules(strictest))
-        missing = len(rays.participants) - len(np.unique(rays.person[label >= 0]))
-        if missing:
-            reason = f"{missing:,} participants have no fixation below {choices.velocity[0]:g} degrees per second"
+        strictest = _make_rules({"velocity": choices.velocity[0], "min_fixation": choices.min_fixation[1]})
+        label, _ = label_fixations(rays, strictest)
+        without = rays.select(~np.isin(rays.person, rays.person[label >= 0]))
+        if len(without):
+            remedy = f"{parameter('fixations', 'ivt')} and a larger {parameter('max_step')} of nerg rays filter"
+            slow = describe_slow_sampling(without, strictest)
+            how = (
+                f" ({slow}; select them before, with {remedy})"
+                if slow
+                else f" below {choices.velocity[0]:g} degrees per second"
+            )
+            reason = f"{len(np.unique(without.person)):,} participants have no fixation{how}"
     if not reason:
         return choices
     if "all" not in choices.samples:

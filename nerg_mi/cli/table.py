@@ -118,7 +118,7 @@ TABLE = (
         computes=False,
         spellings={"persons": ("--person",), "without_persons": ("--without-person",), "cohorts": ("--cohort",)},
         without=("thin_distance", "with_hit", "seed", "head_velocity", "pursuit_velocity", "pursuit_angle", "merge_gap")
-        + ("max_blink", "eye_velocity", "max_step"),
+        + ("max_blink", "eye_velocity"),
     ),
     Row(
         "rays split",

@@ -193,7 +193,8 @@ def draw_scanpath(
             )
         warn_unknown_tracking(data.tracking, reporter.warn)
         warn_slow_sampling(data, rules, reporter)
-        fixations, durations = average_fixations(data, label_fixations(data, rules, dispersion_threshold)[0])
+        label, _ = label_fixations(data, rules, dispersion_threshold)
+        fixations, durations = average_fixations(data, label, rules, dispersion_threshold)
         order = np.lexsort((fixations.t, fixations.person))
         rank = np.arange(len(order)) - np.searchsorted(fixations.person[order], fixations.person[order])
         rows = order[rank < max_fixations]

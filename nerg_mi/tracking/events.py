@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, parameter
 from nerg_mi.maths import vmf
 
 from .event_settings import FIXATIONS, KINDS, MAX_STEP, EventRules
-from .filters import MAX_PAUSE, group_by_person
+from .filters import MAX_PAUSE, estimate_interval, group_by_person
 from .rays import TRACKING, Rays
 
 # ---- Fixations ----
@@ -103,18 +103,40 @@ def label_fixations(
     return label, events.kind[mask]
 
 
-def average_fixations(rays: Rays, label: np.ndarray) -> tuple[Rays, np.ndarray]:
+def describe_slow_sampling(rays: Rays, rules: EventRules) -> str:
+    """Return that samples are too far apart for fixations by ``rules``, as part of a sentence; "" if they are not."""
+    interval = estimate_interval(np.diff(rays.t)[np.diff(rays.person) == 0])
+    if not interval > rules.max_step * (1 - 1e-6):
+        return ""
+    return f"samples are {interval:.3g} s apart, and intervals above {rules.max_step:g} s end fixations"
+
+
+def explain_missing_fixations(rays: Rays, rules: EventRules, dispersion: float | None = None) -> str:
+    """Return why ``rays`` have no fixation by these limits, and the remedy, as part of a sentence."""
+    if slow := describe_slow_sampling(rays, rules):
+        return f"{slow}: raise {parameter('max_step')}"
+    name, limit = "velocity_threshold", f"below {rules.velocity_threshold:g} degrees per second"
+    if dispersion is not None:
+        name, limit = "dispersion_threshold", f"within {dispersion:g} degrees"
+    return (
+        f"gaze never stays {limit} for {rules.min_fixation:g} s: raise {parameter(name)}, or lower "
+        f"{parameter('min_fixation')}"
+    )
+
+
+def average_fixations(
+    rays: Rays, label: np.ndarray, rules: EventRules | None = None, dispersion: float | None = None
+) -> tuple[Rays, np.ndarray]:
     """Average the rays of each fixation.
 
     Returns F rays, with the mid time and the mean origin, direction, confidence, hit point and head (of those that are
     finite) of the rays with the same number in ``label`` (N,; -1: none), and the durations (F,) in seconds. Raises
-    `NergError` if there is no fixation.
+    `NergError` if there is no fixation, by the limits of `label_fixations`.
     """
     rows = np.flatnonzero(label >= 0)
     if not rows.size:
-        raise NergError(
-            "no fixation was detected; raise the velocity or the dispersion threshold, or lower the minimum duration"
-        )
+        reason = explain_missing_fixations(rays, rules or EventRules(), dispersion)
+        raise NergError(f"no fixation was detected; {reason}")
     _, index, number = np.unique(label[rows], return_index=True, return_inverse=True)
     n = np.bincount(number).astype(np.float64)
     mean = lambda v: np.stack([np.bincount(number, weights=c) for c in v[rows].T], axis=1) / n[:, None]

@@ -19,8 +19,7 @@ from nerg_mi.progress import Progress, Reporter, open_reporter
 
 from .dataset import open_rays
 from .event_settings import FIXATIONS, EventRules
-from .events import Events, detect_events, warn_unknown_tracking
-from .filters import estimate_interval
+from .events import Events, describe_slow_sampling, detect_events, warn_unknown_tracking
 from .quality import GazeTarget, RecordingQuality, measure_recordings
 from .rays import Rays
 from .readers.columns import open_named_table
@@ -181,13 +180,10 @@ def read_targets(file: FilePath, participants: Sequence[str]) -> list[GazeTarget
 
 
 def warn_slow_sampling(rays: Rays, rules: EventRules, reporter: Reporter) -> None:
-    """Warn of rays whose intervals are mostly pauses by the rules."""
-    steps = np.diff(rays.t)[np.diff(rays.person) == 0]
-    interval, longest = estimate_interval(steps), rules.max_step
-    if interval > longest * (1 - 1e-6):
+    """Warn of rays whose samples are too far apart for fixations by the rules."""
+    if slow := describe_slow_sampling(rays, rules):
         reporter.warn(
-            f"samples are {interval:.3g} s apart, and intervals above {longest:g} s are pauses: raise "
-            f"{parameter('max_step')}; saccades, which last 0.02 to 0.1 s, are not resolved"
+            f"{slow}: raise {parameter('max_step')}; saccades, which last 0.02 to 0.1 s, and blinks are not resolved"
         )
 
 

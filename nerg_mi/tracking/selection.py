@@ -206,14 +206,14 @@ class _Step:
 
 
 class _Steps:
-    """Applies steps to rays one after the other.
+    """Applies steps to rays one after the other. ``reason`` is why there are no fixations.
 
     ``in_place`` tells whether the rays are not used elsewhere, so that they may be modified in place. ``reporter`` None
     is for one of several blocks: nothing is reported, and a step may select no ray.
     """
 
     def __init__(self, rays: Rays, in_place: bool, reporter: Reporter | None) -> None:
-        self.rays, self.taken, self.fixations = rays, list[_Step](), 0
+        self.rays, self.taken, self.fixations, self.reason = rays, list[_Step](), 0, ""
         self._in_place, self._reporter = in_place, reporter
 
     def follow(self, selection: _Selection) -> None:
@@ -230,6 +230,10 @@ class _Steps:
         if len(self.rays):
             label = events.label_fixations(self.rays, rules, dispersion)[0]
         self.fixations = len(np.unique(label[label >= 0]))
+        if not self.fixations:
+            self.reason = events.explain_missing_fixations(self.rays, rules, dispersion)
+            if self._reporter is not None:
+                raise NergError(f"no fixation was detected; {self.reason}")
         if self._reporter is not None:
             self._reporter.message(f"{self.fixations:,} fixations ({selection.fixations})")
         settings = {"by": selection.fixations, **rules.describe(dispersion)}
@@ -237,7 +241,7 @@ class _Steps:
             self.select_mask(label >= 0, "fixations", settings)
             return
         before = len(self.rays)
-        merged = events.average_fixations(self.rays, label)[0] if before else self.rays
+        merged = events.average_fixations(self.rays, label)[0] if self.fixations else self.rays.select(label >= 0)
         self._apply(merged, "fixations", before, {**settings, "one_ray": True})
 
     def select_mask(self, mask: np.ndarray, name: str, settings: dict[str, Any]) -> None:
@@ -287,7 +291,7 @@ class _Totals:
 
     def __init__(self, dataset: RayDataset, selection: _Selection, reporter: Reporter) -> None:
         self._count, self._selection, self._reporter = len(dataset), selection, reporter
-        self._steps, self._fixations = list[_Step](), 0
+        self._steps, self._fixations, self._reason = list[_Step](), 0, ""
         if selection.fixations is not None:
             events.warn_unknown_tracking(dataset.metadata.get("tracking", "unknown"), reporter.warn)
 
@@ -298,6 +302,7 @@ class _Totals:
             steps = _Steps(block, True, None)
             steps.follow(self._selection)
             self._fixations += steps.fixations
+            self._reason = self._reason or steps.reason
             first = [_Step("filter", len(block), 0, conditions)] if conditions else []
             taken = [*first, *steps.taken]
             before = self._steps or [replace(step, kept=0, of=0) for step in taken]
@@ -311,6 +316,8 @@ class _Totals:
 
     def report(self) -> list[dict[str, Any]]:
         """Report and return the steps over all blocks. Raises `NergError` if nothing was selected."""
+        if self._reason and not self._fixations:
+            raise NergError(f"no fixation was detected; {self._reason}")
         if not self._steps or not self._steps[-1].kept:
             raise NergError(f"none of {self._count:,} rays are selected; widen the conditions")
         # Conditions count all rays, many of which were not read.

@@ -123,8 +123,15 @@ def test_one_ray_per_fixation():
     assert np.allclose(one.hit[0], hit[:4].mean(axis=0)) and np.isnan(one.hit[1]).all()
     want = np.array([8.0, 1, 0])
     assert np.allclose(one.head[0], want / np.linalg.norm(want)) and np.isnan(one.head[1]).all()
-    with pytest.raises(NergError, match="no fixation"):
+    with pytest.raises(NergError, match="no fixation") as error:
         average_fixations(rays, np.full(20, -1))
+    assert set(error.value.parameters) == {"velocity_threshold", "min_fixation"}
+    with pytest.raises(NergError, match="2.5 degrees") as error:
+        average_fixations(rays, np.full(20, -1), dispersion=2.5)
+    assert "dispersion_threshold" in error.value.parameters
+    with pytest.raises(NergError, match="0.2 s apart.* 0.1 s") as error:
+        average_fixations(replace(rays, t=10 * rays.t), np.full(20, -1))
+    assert set(error.value.parameters) == {"max_step"}
     with pytest.raises(NergError, match="dispersion must be positive"):
         detect_fixations_idt(rays, dispersion=0)
 

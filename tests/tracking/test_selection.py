@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nerg_mi.errors import NergError
+from nerg_mi.cli.building import choose_spelling
+from nerg_mi.errors import NergError, clean_text
+from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.tracking import selection
 from nerg_mi.tracking.dataset import DatasetManifest, RayDataset, write_dataset_manifest
 from nerg_mi.tracking.dataset_write import SourceWriter
@@ -17,6 +19,7 @@ from tests.cli.rays.running import write_walk
 from tests.recorder import Recorder
 from tests.refusals import mentions
 from tests.tracking.dataset.making import DAY, MAP, assert_same, crowd, write_dataset
+from tests.tracking.people import some_rays
 
 
 @pytest.fixture
@@ -178,6 +181,23 @@ def test_samples_of_a_dataset_are_uniform(parquet, tmp_path):
     assert counts.sum() == 1200 and counts.max() <= 8 and thirds.min() > 80 and thirds.max() < 190
     with pytest.raises(NergError, check=mentions("sample")):
         filter_rays(dataset.folder, sample=4, output=tmp_path / "c.rays")
+
+
+@pytest.mark.parametrize("fixations", ["ivt", "idt"])
+@pytest.mark.parametrize("merge_fixations", [False, True])
+def test_the_reason_for_no_fixations_is_named(fixations, merge_fixations, parquet, tmp_path):
+    slow = some_rays(40, t=np.arange(40) / 5).with_tracking("eye")
+    options: dict = {"fixations": fixations, "merge_fixations": merge_fixations, "progress": Recorder()}
+    for rays in (slow, write_dataset_of(slow, tmp_path / "slow.rays")):
+        with pytest.raises(NergError, match="0.2 s apart.* 0.1 s") as error:
+            filter_rays(rays, **options)
+        assert set(error.value.parameters) == {"max_step"}
+        assert "--max-step" in clean_text(error.value.message, choose_spelling(["rays", "filter"]))
+        assert len(filter_rays(rays, **options, rules=EventRules(max_step=0.3))) == (1 if merge_fixations else 40)
+    fast = some_rays(40, t=np.arange(40) / 50, direction=fibonacci_directions(64)[::-1][:40])
+    with pytest.raises(NergError) as error:
+        filter_rays(fast.with_tracking("eye"), **options)
+    assert ("velocity_threshold" if fixations == "ivt" else "dispersion_threshold") in error.value.parameters
 
 
 def test_impossible_filters_of_datasets_are_refused(parquet, tmp_path, monkeypatch):
