@@ -14,8 +14,8 @@ KINDS = {
     "smooth_pursuit": "gaze moves slowly and steadily, away from any fixed point and direction",
     "saccade": "gaze moves fast, and so does the eye in the head",
     "visual_scanning": "gaze moves fast, carried along by the head",
-    "blink": "pause between samples, no longer than a blink",
-    "loss": "longer pause between samples",
+    "blink": "pause of several missing samples, no longer than a blink",
+    "loss": "other pause with missing samples",
 }
 """Kinds of events, and what they are."""
 
@@ -60,7 +60,10 @@ class EventRules(ValidatedDataclass):
         0.04, "Longest slow interruption of a saccade or visual scanning in seconds.", allowed=SECONDS
     )
     max_step: float = setting(
-        MAX_STEP, "Longest interval between consecutive samples in seconds; a longer one is a pause.", allowed=SECONDS
+        MAX_STEP,
+        "Longest interval between consecutive samples in seconds; a longer one ends fixations, and is a pause if "
+        "samples are missing.",
+        allowed=SECONDS,
     )
     max_blink: float = setting(0.5, "Longest pause in seconds that is a blink.", allowed=SECONDS)
 

@@ -240,6 +240,7 @@ _CODES = {name: code for code, name in enumerate(KINDS)}
 _MIN_STRAIGHTNESS = 0.5  # of a pursuit: its net angle relative to the sum of its steps
 _MIN_HIT_FRACTION = 0.5  # of the samples of a run, for a fixed point
 _MIN_POINT_DISTANCE = 0.1  # metres between an eye and a fixed point
+_MIN_MISSING = 2  # samples in a blink: a single one is missing for many reasons
 
 
 @dataclass(frozen=True, eq=False)
@@ -329,7 +330,8 @@ def detect_events(rays: Rays, rules: EventRules | None = None) -> Events:
     them for up to ``rules.merge_gap``, is a saccade or visual scanning.
     A run of slow steps is a fixation or pursuit, if it lasts ``rules.min_fixation``: a pursuit if gaze drifts steadily
     away both from its mean direction and, where hit points are known, from their mean, which is fixed also for somebody
-    who walks past. Shorter slow runs are no event. A pause longer than a minute separates recordings.
+    who walks past. Shorter slow runs are no event. A step longer than ``rules.max_step`` is a pause if samples are
+    missing, by the sampling interval of the recording. One longer than a minute separates recordings.
     """
     require_gaze(rays)
     rules = rules or EventRules()
@@ -337,8 +339,9 @@ def detect_events(rays: Rays, rules: EventRules | None = None) -> Events:
     with np.errstate(invalid="ignore"):
         is_joined = (v.step > 0) & (v.step <= rules.max_step)
         is_fast = is_joined & (v.gaze > rules.velocity_threshold)
-        is_pause = (v.step > rules.max_step) & (v.step <= MAX_PAUSE)
-        is_blink = is_pause & (v.step <= rules.max_blink)
+        missing = _count_missing(v.step)
+        is_pause = (v.step > rules.max_step) & (v.step <= MAX_PAUSE) & (missing > 0)
+        is_blink = is_pause & (v.step <= rules.max_blink) & (missing >= _MIN_MISSING)
     is_fast = _fill_interruptions(is_fast, is_joined, rays.t[v.order], rules.merge_gap)
     fast, slow = _find_runs(is_fast), _find_runs(is_joined & ~is_fast)
     slow = _select_long(slow, rays.t[v.order], rules.min_fixation)
@@ -371,6 +374,14 @@ def detect_events(rays: Rays, rules: EventRules | None = None) -> Events:
         direction[by_time],
         point[by_time],
     )
+
+
+def _count_missing(step: np.ndarray) -> np.ndarray:
+    """Number (N - 1,) of samples that are missing in each step in seconds, by the sampling interval of its recording.
+    Recordings are separated by NaN, and by pauses longer than `MAX_PAUSE`."""
+    bounds = np.r_[0, np.flatnonzero(~(step <= MAX_PAUSE)) + 1, len(step)]
+    intervals = [estimate_interval(step[a:b][step[a:b] <= MAX_PAUSE]) for a, b in zip(bounds[:-1], bounds[1:])]
+    return np.rint(step / np.repeat(intervals, np.diff(bounds))) - 1
 
 
 def _find_runs(mask: np.ndarray) -> np.ndarray:

@@ -19,7 +19,7 @@ from nerg_mi.tracking.events import (
     label_fixations,
     measure_velocities,
 )
-from nerg_mi.tracking.rays import Rays
+from nerg_mi.tracking.rays import Rays, merge_rays
 from tests.tracking.people import some_rays
 
 # ---- Fixations ----
@@ -261,6 +261,28 @@ def test_pauses():
     assert events.kind.tolist() == ["fixation", "blink", "fixation", "loss", "fixation", "fixation"]
     np.testing.assert_allclose(events.duration[[1, 3]], [0.21, 3.01])
     assert detect_events(scene(np.zeros(80), t=t), EventRules(max_blink=0.1)).count()["loss"] == 2
+
+
+@pytest.mark.parametrize(
+    "rate, lengths, kinds",
+    [
+        (5, [1, 2, 3], ["loss", "loss"]),  # the interval is no pause, and a blink cannot be told from a lost sample
+        (10, [2, 3, 4, 6], ["loss", "blink", "blink", "loss"]),
+        (30, [2, 4, 14, 16], ["blink", "blink", "loss"]),
+        (500, [40, 60, 240, 260], ["blink", "blink", "loss"]),
+    ],
+)
+@pytest.mark.parametrize("jitter", [0.0, 0.05])
+def test_pauses_depend_on_the_sampling_interval(rate, lengths, kinds, jitter):
+    """Pauses of so many intervals, each after a second of samples, with times that vary by a part of the interval."""
+    steps = np.concatenate([[*np.ones(rate), length] for length in [*lengths, 1]])
+    t = (np.cumsum(steps) + np.random.default_rng(0).uniform(0, jitter, len(steps))) / rate
+    rays = scene(np.zeros(len(t)), t=t)
+    select_pauses = lambda rays: [k for k in detect_events(rays).kind.tolist() if k in ("blink", "loss")]
+    assert select_pauses(rays) == kinds
+    # Other participants and recordings have their own intervals.
+    late, fast = replace(rays, t=t + 1000), scene(np.zeros(400), t=np.arange(400) / 100, person=np.ones(400))
+    assert select_pauses(merge_rays([rays, late, fast])) == 2 * kinds
 
 
 def test_events_do_not_span_participants_or_depend_on_the_order():
