@@ -36,7 +36,7 @@ from nerg_mi.formats.alignments import AnySimilarity
 from nerg_mi.formats.boxes import Region
 from nerg_mi.maths.types import Axes, Figure
 from nerg_mi.progress import Progress, open_reporter
-from nerg_mi.ranges import LENGTHS, POSITIVE_VALUES, Range, check_ranges
+from nerg_mi.ranges import LENGTHS, POSITIVE_VALUES, SPP, Range, check_ranges
 from nerg_mi.tracking.dataset import open_rays
 from nerg_mi.tracking.objects import ObjectPoses
 from nerg_mi.tracking.rays import Rays
@@ -53,7 +53,6 @@ _LEVEL = 0.9  # cosine of the angle to the upward direction from which an area l
 _CAMERA_DISTANCE = 0.1  # of the camera from the area, relative to its diagonal; what is nearer is in the picture
 _SIGMA_RATIO = 1.1  # between kernel widths that are computed apart
 _GREY = 0.2  # linear, of an area without an environment
-_SPP = 8
 
 
 # ---- The rectangle ----
@@ -154,15 +153,16 @@ class FlatArea:
         width, height = np.maximum(np.round(self.size * resolution / self.size.max()), 1).astype(int).tolist()
         return height, width
 
-    def make_sensor(self, shape: tuple[int, int]) -> Any:
-        """Return an orthographic camera in front of the area, whose film has the ``shape`` (height, width)."""
+    def make_sensor(self, shape: tuple[int, int], spp: int) -> Any:
+        """Return an orthographic camera in front of the area, whose film has the ``shape`` (height, width), with
+        ``spp`` samples per pixel."""
         import mitsuba as mi
 
         target = self.corner + self.size / 2 @ self.axes
         distance = _CAMERA_DISTANCE * float(np.linalg.norm(self.size))
         origin = (target + distance * self.normal).tolist()
         camera = Camera(origin, target.tolist(), (-self.axes[1]).tolist(), width=shape[1], height=shape[0])
-        content = {name: value for name, value in camera.to_dict(_SPP).items() if not name.startswith("fov")}
+        content = {name: value for name, value in camera.to_dict(spp).items() if not name.startswith("fov")}
         half = float(self.size[0]) / 2
         to_world = content["to_world"] @ mi.ScalarTransform4d().scale([half, half, 1])
         clip = {"near_clip": 1e-3 * distance}
@@ -250,6 +250,7 @@ def draw_area(
     smoothing: Annotated[float, Range(0, 30)] = SMOOTHING,
     smoothing_length: Annotated[float, LENGTHS] | None = None,
     resolution: Annotated[int, Range(16, 4096)] = 800,
+    spp: Annotated[int, SPP] = 8,
     vmax: Annotated[float, POSITIVE_VALUES] | None = None,
     style: Style = Style(),
     progress: Progress = None,
@@ -283,6 +284,8 @@ def draw_area(
         Standard deviation in metres on the area, in place of ``smoothing``.
     resolution : int
         Pixels along the longer side of the area.
+    spp : int
+        Samples per pixel of the picture of the area, in an environment.
     vmax : float, optional
         Upper end of the colour scale, per square metre. Default: the 99.5th percentile.
     style : Style
@@ -345,7 +348,7 @@ def draw_area(
                 "occluded; check the alignment, and the corners or the thickness of the area"
             )
         reporter.progress(0.5, "rendering the area")
-        color = _render_front(placed.environment, flat, shape)
+        color = _render_front(placed.environment, flat, shape, spp)
         lengths = samples["distance"] * np.tan(np.radians(smoothing))
         lengths = lengths if smoothing_length is None else np.full(len(lengths), smoothing_length)
         pixels = np.column_stack([samples["x_px"], samples["y_px"]])[is_seen]
@@ -454,13 +457,13 @@ def _list_samples(
     }
 
 
-def _render_front(environment: Environment, flat: FlatArea, shape: tuple[int, int]) -> np.ndarray:
+def _render_front(environment: Environment, flat: FlatArea, shape: tuple[int, int], spp: int) -> np.ndarray:
     """Return the linear image (height, width, 3) of the area from its front, grey without an environment."""
     if not environment.has_surfaces:
         return np.full((*shape, 3), _GREY)
     source = environment.input
     scene = Scene.coerce(source) if environment.nerg is not None else make_scene(source)
-    color = render(scene, quantities="color", camera=flat.make_sensor(shape), progress=False).color[0]
+    color = render(scene, quantities="color", camera=flat.make_sensor(shape, spp), progress=False).color[0]
     return np.broadcast_to(color, (*shape, 3))
 
 

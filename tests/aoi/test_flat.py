@@ -128,6 +128,20 @@ def test_the_picture_is_seen_from_the_front():
         assert np.allclose(quarters / quarters.max(axis=1, keepdims=True), [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]])
 
 
+def test_more_samples_per_pixel_have_less_noise():
+    import mitsuba as mi
+
+    rays, _ = look(20)
+    half = mi.ScalarTransform4f()
+    lamp = {"type": "rectangle", "to_world": half.look_at([1, 1.2, 1.4], [3, 1.2, 1.4], [0, 0, 1]).scale([0.4, 0.4, 1])}
+    lamp["emitter"] = {"type": "area", "radiance": {"type": "rgb", "value": 1.0}}
+    scene = {"type": "scene", "integrator": {"type": "path", "max_depth": 2}, "lamp": lamp, **painted_poster()}
+    area = {"corners": corners(), "resolution": 64}
+    exact, *others = (draw_area([rays, scene], spp=spp, **area).color for spp in (4096, 4, 64))
+    few, many = (np.sqrt(((color - exact) ** 2).mean()) for color in others)
+    assert few / many == pytest.approx(4, rel=0.15) and many < 0.2 * exact.mean()
+
+
 def test_gaze_on_an_area_that_moves():
     rays, xy = look()
     turn = Rotation.from_euler("z", 3 * rays.t[:, None], degrees=True)
