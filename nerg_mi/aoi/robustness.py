@@ -43,7 +43,14 @@ from .placed import PlacedAreas, open_placed_areas, place_areas
 from .predicted import PredictedAttention, Viewpoints, aggregate_by_participant, predict_attention
 from .robustness_output import Conclusion, RobustnessResult, conclusion_rows
 from .settings import AoiSampling, Choices, ObserverGrid, TrackerError, VisitRules
-from .statistics import AttentionAnalysis, list_inputs, open_counting, open_inputs
+from .statistics import (
+    AttentionAnalysis,
+    list_inputs,
+    open_counting,
+    open_inputs,
+    report_values_without_comparison,
+    warn_unused_fixation_part,
+)
 from .statistics_parts import (
     ObserverPoses,
     PartitionedStatistics,
@@ -499,10 +506,12 @@ def robustness(
             base: Analyses | Predictions = Predictions(
                 placed, networks, measured.viewpoints, is_recorded, sigma, measured.times
             )
+            warn_unused_fixation_part(counting, None, reporter)
         else:
             assert chosen.rays is not None
             gaze_fields, base = [], Analyses(placed, open_rays(chosen.rays), counting)
             counting.disturbance.check_participants(base.rays.persons, reporter)
+            warn_unused_fixation_part(counting, base.rays, reporter)
         for note in placed.warnings:
             reporter.message(note)
         choices = _adapt_choices(choices, base, align, reporter)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,7 +27,8 @@ from nerg_mi.ranges import SECONDS, SEEDS, TIMES, Range, check_ranges
 from nerg_mi.tasks.parts import PartRunner
 from nerg_mi.tasks.settings import Parallel
 from nerg_mi.tracking.dataset import RayDataset, open_recordings
-from nerg_mi.tracking.event_settings import read_fixations
+from nerg_mi.tracking.event_settings import EventRules, read_fixations
+from nerg_mi.tracking.events import describe_slow_sampling, label_fixations
 from nerg_mi.tracking.objects import ObjectPoses
 from nerg_mi.tracking.pseudonyms import make_pseudonyms, read_salt
 from nerg_mi.tracking.rays import TRACKING, Rays
@@ -290,6 +291,33 @@ def open_counting(
     return counting, existing_files(cohorts, validation, *(() if opened is None else opened.files))
 
 
+def warn_unused_fixation_part(counting: Counting, rays: Rays | RayDataset | None, reporter: Reporter) -> None:
+    """Warn if the part of the tracker's offset that changes between fixations has no effect, or changes between
+    samples, since ``rays`` have no fixations."""
+    if not counting.error.fixation_part > 0:
+        return
+    part = parameter("fixation_part", f"{counting.error.fixation_part:g}")
+    if not counting.has_error:
+        reporter.warn(
+            f"{part} has no effect, because no error of the tracker is given: add {parameter('accuracy')} or "
+            f"{parameter('validation')}"
+        )
+    elif rays is None:
+        reporter.warn(f"{part} has no effect, because predictions depend on the sum of all errors")
+    elif not read_fixations(rays.metadata).get("fixations", {}).get("one_ray"):  # each of which is a fixation
+        first = None
+        for block in iter_blocks(rays, counting.rules):
+            if (label_fixations(block)[0] >= 0).any():
+                return
+            first = first or block
+        assert first is not None
+        reason = describe_slow_sampling(first, EventRules()) or "gaze never rests"
+        reporter.warn(
+            f"{part} makes offsets that change with each sample, because the rays have no fixations: {reason}; leave "
+            "it out, or give rays of fixations"
+        )
+
+
 def _open_poses(
     objects: FilePath | ObjectPoses | None, pose_gap: float | None, clock_offset: float
 ) -> ObjectPoses | None:
@@ -417,6 +445,7 @@ class AttentionAnalysis:
             raise NergError("there are no observers: give rays or a gaze field")
         if self.rays is not None:
             self.counting.disturbance.check_participants(self.rays.persons, self.reporter)
+        warn_unused_fixation_part(self.counting, self.rays, self.reporter)
 
     def measure(self, num_viewpoints: int, observers: np.ndarray | None, grid: ObserverGrid) -> MeasuredAttention:
         """Count visits, and predict the attention from recorded positions or those of observers."""
@@ -444,7 +473,6 @@ class AttentionAnalysis:
                 if predicted_people is not None:
                     people[cell][PREDICTED] = predicted_people
         _report_small_groups(people, self.reporter)
-        _report_values_without_comparison(people, self.reporter)
         return MeasuredAttention(sums, disturbed, viewpoints, predicted, people, times)
 
     def _count(self, rays: Rays | RayDataset, num_viewpoints: int) -> tuple[VisitSums, Viewpoints]:
@@ -540,6 +568,7 @@ class AttentionAnalysis:
         if power is not None:
             self.reporter.progress(0.95, "power of differences")
             power_table = power_rows(names, people, suppression, power, seed=seed)
+        report_values_without_comparison(people, MAX_COMPARED_VALUES, self.reporter)
         differences = difference_rows(names, people, suppression, resamples=self.resamples, seed=seed)
         recorded: dict[str, Any] = {}
         if self.counting.has_error:
@@ -596,13 +625,14 @@ class AttentionAnalysis:
         return ParticipantRows(sums, named, self.counting.aoi_visibility)
 
 
-def _report_values_without_comparison(people: Mapping[Cell, Mapping[str, Participants]], reporter: Reporter) -> None:
-    for dimension in dict.fromkeys(cell.dimension for cell in people):
-        values = [cell.value for cell in people if cell.dimension == dimension]
-        if len(values) > MAX_COMPARED_VALUES:
+def report_values_without_comparison(cells: Collection[Cell], limit: int, reporter: Reporter) -> None:
+    """Warn of dimensions of ``cells`` with more than ``limit`` values, of which the first ones are compared."""
+    for dimension in dict.fromkeys(cell.dimension for cell in cells):
+        values = [cell.value for cell in cells if cell.dimension == dimension]
+        if len(values) > limit:
             reporter.warn(
-                f"differences are those between the first {MAX_COMPARED_VALUES} of {len(values)} values of "
-                f'{dimension}; "{values[MAX_COMPARED_VALUES]}" and later ones are not compared'
+                f"differences are those between the first {limit} of {len(values)} values of {dimension}; "
+                f'"{values[limit]}" and later ones are not compared'
             )
 
 
