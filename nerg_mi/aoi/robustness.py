@@ -71,8 +71,8 @@ MEASURES = ("share", "hit_ratio", "visits")
 """Measures whose differences are conclusions. Their denominators do not depend on where the gaze is."""
 
 MAX_PAIRED = 5
-"""Largest number of areas, or of values of a dimension, that are all compared with each other; of more areas,
-neighbours in the order of the reference are, and of more values, the first ones."""
+"""Largest number of areas, of groups, or of values of a dimension that are all compared with each other; of more areas,
+neighbours in the order of the reference are, and of more groups or values, the first ones."""
 
 MAX_SHRINKAGE = 0.45  # of the extent of a box, at each of its sides
 
@@ -301,10 +301,11 @@ def predict_analysis(common: PlannedPredictions, choice: Mapping[str, Any], outp
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Evaluates conclusions from the participants of an analysis; ``areas`` (A,) are names, and ``is_single`` (A,) the
-    areas that are no groups."""
+    """Evaluates conclusions from the participants of an analysis; ``areas`` (A,) are names, and ``members`` (A,) the
+    indices of their elementary areas; ``is_single`` (A,) are those that are no groups."""
 
     areas: Sequence[str]
+    members: Sequence[Sequence[int]]
     is_single: np.ndarray
     resamples: int
     seed: int
@@ -333,6 +334,7 @@ class Evaluation:
         for measure, reference in ranks.items():
             order = np.argsort(reference, kind="stable")[: self.is_single.sum()]
             pairs = list(combinations(order, 2) if len(order) <= MAX_PAIRED else zip(order[:-1], order[1:]))
+            pairs += self._pair_groups(order)
             if pairs:
                 x, y = self._pair(people[ALL], choice, measure)
                 a, b = np.array(pairs).T
@@ -349,6 +351,18 @@ class Evaluation:
                 keys = [Conclusion("cells", measure, first, second, area) for area in self.areas]
                 values |= dict(zip(keys, self._subtract(measure, one, other)))
         return values
+
+    def _pair_groups(self, order: np.ndarray) -> list[tuple[int, int]]:
+        """Return pairs of a group and another one, or an area of no group, that have no area in common; ``order`` are
+        the indices of the areas that are no groups."""
+        groups = np.flatnonzero(~self.is_single).tolist()
+        grouped = {k for group in groups for k in self.members[group]}
+        units = [*groups, *(k for k in order.tolist() if grouped.isdisjoint(self.members[k]))][:MAX_PAIRED]
+        return [
+            (i, j)
+            for i, j in combinations(units, 2)
+            if not self.is_single[i] and set(self.members[i]).isdisjoint(self.members[j])
+        ]
 
     def _subtract(self, measure: str, first: Pair, second: Pair) -> Iterator[tuple[float, float, float]]:
         d = MEASURES_BY_NAME[measure].estimate_differences(second, first, self.resamples, self.seed)
@@ -528,10 +542,13 @@ def robustness(
             results = _compute_in_process(base, table, reporter)
         names = placed.areas.names
         single = np.isin(np.arange(len(names)), AoiContext(placed, counting).transition_areas)
-        evaluation, ranks, estimates = Evaluation(names, single, resamples, seed), {}, []
+        evaluation = Evaluation(names, placed.members, single, resamples, seed)
+        ranks, estimates = dict[str, np.ndarray](), []
         for choice, result in zip(table, results):
             people = base.find_people(result, choice)
-            ranks = ranks or evaluation.rank(people, choice)
+            if not estimates:
+                ranks = evaluation.rank(people, choice)
+                report_values_without_comparison(people, MAX_PAIRED, reporter)
             estimates.append(evaluation.evaluate(people, choice, ranks))
         result = conclusion_rows(estimates, drawn, PREDICTED if gaze_inputs else MEASURED)
         provenance = make_provenance("nerg robustness", files, seed, changed | {"mode": mode})

@@ -23,7 +23,7 @@ from nerg_mi.formats.fields import save_gaze
 from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.tasks.settings import Parallel
-from nerg_mi.tracking.rays import Rays
+from nerg_mi.tracking.rays import Rays, merge_rays
 from tests.aoi.place import people, write_place
 from tests.conftest import ROOT
 from tests.plugins.fields import GRID
@@ -239,6 +239,58 @@ def test09_the_reference_has_the_differences_of_statistics():
             assert [ours[key][name] for name in ("reference", "low", "high")] == expected, key
             compared += 1
     assert compared >= 5
+
+
+def test17_cohorts_and_groups_of_areas_are_compared_as_in_statistics(tmp_path):
+    first, second = (
+        record(np.array(shares), seed, count=8)
+        for seed, shares in enumerate(([0.5, 0.1, 0.2, 0.2], [0.1, 0.3, 0.3, 0.3]))
+    )
+    second = replace(second, persons=tuple(f"q{name}" for name in second.persons))
+    rays, cohorts = merge_rays([first, second]), tmp_path / "cohorts.csv"
+    rows = [f"{name},{'other' if name[0] == 'q' else 'one'}" for name in rays.persons]
+    cohorts.write_text("\n".join(["person,cohort", *rows]))
+    areas = {**AREAS, "a or b": {"parts": ["a", "b"]}, "b or c": {"parts": ["b", "c"]}, "twice": {"parts": ["a or b"]}}
+    result = nerg.robustness(rays, areas, cohorts=cohorts, analyses=10, resamples=1999)
+    stats = nerg.statistics(rays, areas, cohorts=cohorts)
+    shares = {row["aoi"]: row["share"] for row in stats.aois if row["cell"] == "all"}
+    ours = {row["conclusion"]: row for row in result.conclusions if row["measure"] == "share"}
+    # Groups are compared with each other and with other areas, if no sample can be on both by definition.
+    pairs = {frozenset(name.split(" > ")) for name in ours if " > " in name and ": " not in name}
+    assert pairs == {frozenset(pair) for pair in ("ab", "ac", "bc")}
+    differences = [row for row in stats.differences if row["measure"] == "share"]
+    assert {row["aoi"] for row in differences} == set(areas) and len(differences) == 6
+    for row in differences:
+        names = ("one", "other") if row["difference"] < 0 else ("other", "one")
+        row_of_cohorts = ours[f"{row['aoi']}: cohort {names[0]} > {names[1]}"]
+        assert row_of_cohorts["reference"] == pytest.approx(abs(row["difference"]), rel=1e-6)
+    assert ours["a: cohort one > other"]["verdict"] == "survives"
+    areas = {**AREAS, "a or b": {"parts": ["a", "b"]}}
+    result = nerg.robustness(rays, areas, cohorts=cohorts, analyses=10)
+    (row,) = (r for r in result.conclusions if "a or b" in r["conclusion"].split(" > ") and r["measure"] == "share")
+    assert row["conclusion"] == "a or b > c" and row["verdict"] == "survives"
+    assert row["reference"] == pytest.approx(shares["a or b"] - shares["c"], rel=1e-6)
+    assert not any(r["conclusion"].startswith("a or b is number") for r in result.conclusions)
+    assert any("cohort" in axes.get_title("left") for axes in result.draw().ravel())
+
+
+def test18_cohorts_that_are_not_compared_are_reported(tmp_path):
+    rays, recorder = record(np.array([0.3, 0.3, 0.2, 0.2]), 1, count=7), Recorder()
+    (tmp_path / "cohorts.csv").write_text("\n".join(["person,cohort", *(f"{p},cohort {p}" for p in rays.persons)]))
+    nerg.robustness(rays, AREAS, cohorts=tmp_path / "cohorts.csv", analyses=10, progress=recorder)
+    assert any("first 5 of 7" in text and '"cohort p05"' in text for text in recorder.warnings)
+
+
+def test19_slow_samples_are_named_as_the_reason_for_no_fixations():
+    rays, recorder = record(np.array([0.4, 0.3, 0.1, 0.2]), 2, count=4), Recorder()
+    slow = replace(rays, t=4 * rays.t)  # five samples per second
+    result = nerg.robustness(slow, AREAS, analyses=10, progress=recorder)
+    assert {choice["samples"] for choice in result.analyses} == {"all"}
+    (text,) = (text for text in recorder.messages if "fixation" in text)
+    assert "0.2 s apart" in text and "max_step" in text and "degrees per second" not in text
+    with pytest.raises(nerg.NergError, match="0.2 s apart") as error:
+        nerg.robustness(slow, AREAS, analyses=10, choices=Choices(samples=("fixations",)))
+    assert "max_step" in error.value.parameters
 
 
 def test11_an_environment_in_memory_has_its_alignment(tmp_path, rgb):
