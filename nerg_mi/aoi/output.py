@@ -26,7 +26,11 @@ from .visits import VisitSums
 MAX_MARKDOWN_ROWS = 10_000  # maximum number of rows of a Markdown table
 _PARQUET_BATCH = 1 << 16
 SUPPORT = "support [samples]"
-_WHAT_IF_TITLES = {"share": "attention share", "visible": "visible share"}
+_WHAT_IF_TITLES = {
+    "share": "attention share",
+    "corrected_share": "attention share, corrected for the tracker",
+    "visible": "visible share",
+}
 _TEXT_COLUMNS = {
     "cell",
     "value",

@@ -125,6 +125,13 @@ class PredictedAttention:
     note: str = ""
     disturbed: np.ndarray | None = None
 
+    @property
+    def corrected_share(self) -> np.ndarray:
+        """Attention share extrapolated to no error, (E, A), as in `nerg_mi.aoi.tracker_error`. Needs ``disturbed``."""
+        assert self.disturbed is not None
+        once, twice = self.disturbed
+        return 3 * self.share - 3 * once + twice
+
 
 def subsample_participants(viewpoints: Viewpoints, max_participants: int, reporter: Reporter) -> Viewpoints:
     """Return the viewpoints of at most ``max_participants`` participants.
@@ -306,6 +313,7 @@ def add_uncertainty(
         row["note"] = "; ".join(filter(None, earlier))
 
 
+_OF_VISIBILITY = "visibility does not depend on the gaze field"
 _NO_MEMBERS, _NO_SUPPORT = "the gaze field is no ensemble", "the checkpoint of the gaze field does not store it"
 
 
@@ -380,9 +388,10 @@ def what_if_rows(
 ) -> list[Row]:
     """Compare predictions before and after ``changes``.
 
-    Each row has an area, a measure (``share`` of gaze or ``visible`` share of time), the values ``before`` and
-    ``after``, the ``difference`` with its interval over participants, the standard deviation of the difference over
-    ensemble members (``difference_spread``), and the median ``support`` after the changes. Raises `NergError`.
+    Each row has an area, a measure (``share`` of gaze, ``corrected_share`` if ``before`` has it, or ``visible`` share
+    of time), the values ``before`` and ``after``, the ``difference`` with its interval over participants, the standard
+    deviation of the difference over ensemble members (``difference_spread``), and the median ``support`` after the
+    changes. Raises `NergError`.
 
     Parameters
     ----------
@@ -411,11 +420,14 @@ def what_if_rows(
     names = sorted({*viewpoints.participants, *changed_viewpoints.participants})
     support = median_support(after)
     rows: list[Row] = []
+    corrected = "corrected_share"
     for name in dict.fromkeys((*areas.names, *after_areas.names)):
-        for measure in ("share", "visible"):
+        for measure in ("share", *(() if before.disturbed is None else (corrected,)), "visible"):
             old_sums = _mean_by_participant(viewpoints, names, getattr(before, measure), areas, name)
             new_sums = _mean_by_participant(changed_viewpoints, names, getattr(after, measure), after_areas, name)
             row = _what_if_row(name, measure, old_sums, new_sums, suppression, resamples, seed)
+            if measure == corrected:  # as in the table of the tracker's error
+                row |= {key: None if row[key] is None else min(max(row[key], 0.0), 1.0) for key in ("before", "after")}
             row["difference_spread"] = None
             reasons = {"": [], _NO_SUPPORT if support is None else "": ["support"]}
             if measure == "share" and row["difference"] is not None and len(after.members) > 1:
@@ -426,11 +438,13 @@ def what_if_rows(
                 ]
                 row["difference_spread"] = float(np.std(differences, ddof=1))
             else:
-                reason = _NO_MEMBERS if measure == "share" else "visibility does not depend on the gaze field"
+                reason = {"share": _NO_MEMBERS, corrected: "members are not corrected"}.get(measure, _OF_VISIBILITY)
                 reasons["no difference" if row["difference"] is None else reason] = ["difference_spread"]
             row["note"] = "; ".join(filter(None, (after.note, row["note"], join_reasons(reasons))))
             rows.append(row | {"support": support, "source": PREDICTED})
-    add_adjusted_p(rows)
+    # The correction tests the same differences again.
+    add_adjusted_p([row for row in rows if row["measure"] != corrected])
+    add_adjusted_p([row for row in rows if row["measure"] == corrected])
     return rows
 
 

@@ -546,7 +546,7 @@ class AttentionAnalysis:
             self.reporter.warn(note)
         # Without rays, orientations are unknown.
         fov = self.counting.fov if self.rays is not None else 360.0
-        sigma = self.counting.disturbance.sigma if self.counting.has_error and what_if is None else 0.0
+        sigma = self.counting.disturbance.sigma if self.counting.has_error else 0.0
         if self.parts is None:
             predicted = predict_attention(placed, viewpoints, fov, self.reporter, sigma=sigma)
         else:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from statistics import NormalDist
 
 import numpy as np
 import pytest
 
+from nerg_mi.aoi.areas import Areas
 from nerg_mi.aoi.robustness import robustness
 from nerg_mi.aoi.settings import AoiSampling, TrackerError, VisitRules
 from nerg_mi.aoi.statistics import statistics
@@ -14,7 +16,9 @@ from nerg_mi.aoi.tracker_error import Disturbance, disturb_query, turn_direction
 from nerg_mi.aoi.validations import Validation, read_validation
 from nerg_mi.errors import NergError
 from nerg_mi.tracking.rays import Rays
+from nerg_mi.tracking.selection import filter_rays
 from tests.aoi.place import people, write_place
+from tests.notes import find_wrong_notes
 from tests.recorder import Recorder
 
 RULES = VisitRules(min_visit=0.0)
@@ -152,6 +156,54 @@ def test_predictions_are_corrected(tmp_path, rgb):
             if row["measure"] == "share":
                 assert row["recorded"] == pytest.approx(shares[row["cell"], row["value"], row["aoi"]])
                 assert row["recorded"] != row["disturbed"]
+
+
+def test_predicted_effects_of_changes_are_corrected(tmp_path, rgb):
+    """As the predictions of the areas before, and of those after the change."""
+    scene, areas, error = write_place(tmp_path), tmp_path / "areas.json", TrackerError(accuracy=4.0, draws=2)
+    options = {"sampling": AoiSampling(directions=128, aoi_samples=6), "viewpoints": 20, "resamples": 199}
+    changes = {"move": [{"area": "the sign", "by": [0, 0.5, 0.2]}]}
+    inputs = [scene, people(cohorts=False)]
+    plain = statistics(inputs, areas, what_if=changes, **options)
+    result = statistics(inputs, areas, what_if=changes, error=error, **options)
+    moved = replace(
+        Areas.load(areas),
+        areas=tuple(
+            replace(a, lower=(4.0, 2.0, 1.2), upper=(4.2, 3.0, 2.2)) if a.name == "the sign" else a
+            for a in Areas.load(areas).areas
+        ),
+    )
+    after = statistics(inputs, moved, error=error, **options)
+    assert [r for r in result.what_if if r["measure"] != "corrected_share"] == plain.what_if
+    corrected = {r["aoi"]: r for r in result.what_if if r["measure"] == "corrected_share"}
+    assert set(corrected) == {"the sign", "the stand", "both"} and not find_wrong_notes(result.what_if)
+    for key, tables in (("before", result), ("after", after)):
+        shares = {r["aoi"]: r for r in tables.tracker if (r["source"], r["measure"]) == ("predicted", "share")}
+        for name, row in corrected.items():
+            assert row[key] == pytest.approx(shares[name]["corrected"], rel=1e-6), (key, name)
+    row = corrected["the sign"]
+    assert row["difference"] == pytest.approx(row["after"] - row["before"], abs=1e-9)
+    assert row["low"] < row["difference"] < row["high"] and row["p"] <= row["p_adjusted"]
+    assert all(file.is_file() for file in result.save(tmp_path / "out"))
+
+
+def test_a_part_of_the_offset_without_fixations_is_reported_once():
+    slow, fast = (look(np.zeros((3, 20)), times=np.arange(20) / rate) for rate in (5, 50))
+    error = TrackerError(accuracy=1.0, fixation_part=0.5, draws=2)
+
+    def list_warnings(rays, error, analyse=statistics, **options):
+        recorder = Recorder()
+        analyse(rays, EDGE, error=error, resamples=199, progress=recorder, **options)
+        return [text for text in recorder.warnings if "fixation_part=0.5" in text]
+
+    (text,) = list_warnings(slow, error)
+    assert "0.2 s apart" in text and list_warnings(slow, error, robustness, analyses=10) == [text]
+    assert not list_warnings(fast, error) and not list_warnings(slow, replace(error, fixation_part=0.0))
+    # Each sample is a fixation.
+    merged = filter_rays(fast.with_tracking("eye"), fixations="ivt", merge_fixations=True)
+    assert not list_warnings(merged, error)
+    (text,) = list_warnings(fast, replace(error, accuracy=0.0))
+    assert "no effect" in text and "accuracy" in text
 
 
 def simulate(rng, shares, num, count, spread, sd, noise):
