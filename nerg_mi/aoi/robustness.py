@@ -25,7 +25,7 @@ from nerg_mi.formats.alignments import Alignment, AnySimilarity, open_similarity
 from nerg_mi.formats.boxes import Region
 from nerg_mi.interruption import Interruption
 from nerg_mi.maths.geometry import Similarity
-from nerg_mi.progress import Progress, Reporter, open_reporter
+from nerg_mi.progress import SILENT, Progress, Reporter, SilentReporter, open_reporter
 from nerg_mi.ranges import SEEDS, Range, check_ranges
 from nerg_mi.tasks.execution import prepare_once
 from nerg_mi.tasks.parts import PartRunner
@@ -167,8 +167,8 @@ class Analyses:
         reference |= {"weighting": "participants", "samples": "all", "velocity": None, "min_fixation": None}
         return reference | {"tracker": "corrected" if self.counting.has_error else "ignored"}
 
-    def compute(self, choice: Mapping[str, Any]) -> VisitSums:
-        """Sum the visits with these choices."""
+    def compute(self, choice: Mapping[str, Any], reporter: Reporter = SILENT) -> VisitSums:
+        """Sum the visits with these choices. ``reporter`` is told the progress after each block, and may stop it."""
         rays = self.rays
         if choice["samples"] == "fixations":
             rays = rays.select(label_fixations(rays, _make_rules(choice))[0] >= 0)
@@ -177,7 +177,14 @@ class Analyses:
         if choice["tracker"] == "ignored":
             counting = replace(counting, error=TrackerError(), validation=None)
         context = AoiContext(self._place(choice), counting, self.has_hits, tuple(sorted(self.rays.cohorts)))
-        return merge_sums(count_block(block, context) for block in iter_blocks(rays, rules))
+
+        def count_blocks() -> Iterator[VisitSums]:
+            done = 0
+            for block in iter_blocks(rays, rules):
+                yield count_block(block, context)
+                reporter.progress((done := done + len(block)) / len(rays))
+
+        return merge_sums(count_blocks())
 
     def _place(self, choice: Mapping[str, Any]) -> PlacedAreas:
         placed, (areas, sampling) = self.placed, change_areas(self.placed, choice)
@@ -211,8 +218,9 @@ class Predictions:
         reference |= {"weighting": "participants", "prior_weight": None, "field": 0}
         return reference | {"tracker": "corrected" if self.sigma > 0 else "ignored"}
 
-    def compute(self, choice: Mapping[str, Any]) -> PredictedAttention:
-        """Predict the attention with these choices. The field is moved with the tracking that it was trained on."""
+    def compute(self, choice: Mapping[str, Any], reporter: Reporter = SILENT) -> PredictedAttention:
+        """Predict the attention with these choices. The field is moved with the tracking that it was trained on.
+        ``reporter`` is told the progress after each viewpoint, and may stop it."""
         placed, viewpoints, network = self.placed, self.viewpoints, self.networks[choice["field"]]
         assert placed.sampler is not None
         if choice["prior_weight"] not in (None, network.config.mix):
@@ -227,7 +235,8 @@ class Predictions:
             positions = viewpoints.positions @ motion[:3, :3].T + motion[:3, 3]
             viewpoints = replace(viewpoints, positions=positions)
         sigma = self.sigma if choice["tracker"] == "corrected" else 0.0
-        return predict_attention(placed, viewpoints, 360.0, sigma=sigma)  # nothing here depends on the field of view
+        # Nothing here depends on the field of view.
+        return predict_attention(placed, viewpoints, 360.0, reporter, sigma=sigma)
 
     def find_people(self, predicted: PredictedAttention, choice: Mapping[str, Any]) -> People:
         """Return the participants of an analysis."""
@@ -531,7 +540,7 @@ def robustness(
         choices = _adapt_choices(choices, base, align, reporter)
         changed |= _describe_fixations(base, choices) | describe_tracker_fixations(error)
         reference, num_fields = base.get_reference(), len(base.networks) - 1 if isinstance(base, Predictions) else 0
-        rngs = [np.random.default_rng((seed, k)) for k in range(analyses)]
+        rngs = (np.random.default_rng((seed, k)) for k in range(analyses))
         drawn = [draw_choices(choices, reference.keys(), num_fields, rng) for rng in rngs]
         table = [reference, *drawn]
         reporter.progress(0.0, "analyses")
@@ -664,8 +673,22 @@ def _compute_in_process(base: Analyses | Predictions, table: Sequence[Row], repo
     with Interruption() as stop:
         for k, choice in enumerate(table):
             stop.check()
-            yield base.compute(choice)
-            reporter.progress((k + 1) / len(table), f"{k} of {len(table) - 1} analyses")
+            yield base.compute(choice, _OneAnalysis(stop, reporter, k, len(table)))
+
+
+@dataclass(frozen=True)
+class _OneAnalysis(SilentReporter):
+    """Reports the progress of one of ``count`` analyses, and stops it after Ctrl-C."""
+
+    stop: Interruption
+    reporter: Reporter
+    number: int
+    count: int
+
+    def progress(self, fraction: float, text: str = "") -> None:
+        self.stop.check()
+        done = f"{self.number} of {self.count - 1} analyses"
+        self.reporter.progress((self.number + fraction) / self.count, done)
 
 
 def _compute_in_parts(

@@ -28,6 +28,7 @@ from tests.aoi.place import people, write_place
 from tests.conftest import ROOT
 from tests.plugins.fields import GRID
 from tests.recorder import Recorder
+from tests.tasks.clusters import ClusterOfProcesses, wait_until
 
 CENTERS = np.array([[-8.0, 0.0], [0.0, 0.0], [8.0, 0.0], [0.0, 12.0]])  # degrees; the last one is no area
 DISTANCE = 10.0
@@ -220,6 +221,37 @@ def test15_analyses_resume(tmp_path, rgb, monkeypatch, is_predicted):
     done = [int(text.split()[0]) for _, text in recorder.steps if " of 11 " in text]
     assert done[0] >= 4 and done[-1] == 11
     assert result.estimates == test().estimates
+
+
+def test20_a_cluster_gives_the_same_tables(tmp_path, rgb, equal_processes):
+    """Recordings with validations and cohorts in files, and predictions of fields in files and in memory."""
+    pytest.importorskip("distributed", reason="dask is not installed (extra cluster)")
+    write_place(tmp_path, gaze=False)
+    rays = people(each=20).with_tracking("eye")
+    gaze = [write_gaze(tmp_path / f"{seed}.safetensors", seed) for seed in range(2)]
+    inputs = [tmp_path / "scene.xml", rays]
+    fields = [gaze[0], replace(nerg.GazeField.load(gaze[1]), path=None)]
+    for name, columns in (("validation", "accuracy,precision"), ("cohorts", "cohort")):
+        values = "1.5,0.2" if name == "validation" else "all"
+        rows = [f"{p},{values}{k % 2 if name == 'cohorts' else ''}" for k, p in enumerate(sorted(rays.persons))]
+        (tmp_path / f"{name}.csv").write_text("\n".join([f"person,{columns}", *rows]))
+    options = {name: tmp_path / f"{name}.csv" for name in ("validation", "cohorts")} | {"align": np.eye(4)}
+    options |= {**COARSE, "analyses": 10, "error": TrackerError(draws=2)}
+    cases = [(inputs, {}), ([*inputs, *fields], {"choices": replace(FIXED, prior_weight=(0.3, 0.3))})]
+
+    def test(number, **more):
+        return nerg.robustness(cases[number][0], tmp_path / "areas.json", **options, **cases[number][1], **more)
+
+    with ClusterOfProcesses(tmp_path) as cluster:
+        cluster.start_worker(), cluster.start_worker()
+        wait_until(lambda: all("connected to" in cluster.log(f"worker{k}") for k in (0, 1)), "both workers are there")
+        parallels = [Parallel(store=tmp_path / f"store{k}", scheduler=cluster.address) for k in range(2)]
+        results = [test(k, parallel=parallel) for k, parallel in enumerate(parallels)]
+    for k, result in enumerate(results):
+        expected = test(k)
+        assert result.estimates == expected.estimates and result.conclusions == expected.conclusions
+        assert result.analyses == expected.analyses and any("cohort" in r["conclusion"] for r in result.conclusions)
+        assert {a["tracker"] for a in result.analyses} == {"corrected", "ignored"}
 
 
 def test09_the_reference_has_the_differences_of_statistics():
