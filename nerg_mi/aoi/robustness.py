@@ -25,6 +25,7 @@ from nerg_mi.formats.alignments import Alignment, AnySimilarity, open_similarity
 from nerg_mi.formats.boxes import Region
 from nerg_mi.interruption import Interruption
 from nerg_mi.maths.geometry import Similarity
+from nerg_mi.maths.transforms import transform_points
 from nerg_mi.progress import SILENT, Progress, Reporter, SilentReporter, open_reporter
 from nerg_mi.ranges import SEEDS, Range, check_ranges
 from nerg_mi.tasks.execution import prepare_once
@@ -232,8 +233,7 @@ class Predictions:
         sampler = replace(placed.sampler, gaze=moved)
         placed = place_areas(placed.environment, sampler, areas, placed.meshes, sampling)
         if self.is_recorded:
-            positions = viewpoints.positions @ motion[:3, :3].T + motion[:3, 3]
-            viewpoints = replace(viewpoints, positions=positions)
+            viewpoints = replace(viewpoints, positions=transform_points(motion, viewpoints.positions))
         sigma = self.sigma if choice["tracker"] == "corrected" else 0.0
         # Nothing here depends on the field of view.
         return predict_attention(placed, viewpoints, 360.0, reporter, sigma=sigma)

@@ -20,6 +20,7 @@ from nerg_mi.formats.fields import load_gaze, matches_checksum, save_gaze
 from nerg_mi.maths import vmf
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.maths.transforms import transform_points
 from nerg_mi.progress import Progress, Reporter, open_reporter
 from nerg_mi.ranges import DIRECTIONS, Range, check_number
 from nerg_mi.tracking.dataset import open_rays
@@ -151,7 +152,7 @@ class GazeField(TrainedField[GazeNetwork]):
             # A gaze field maps the frame of the rays by its alignment, and a scene may map that of the field.
             matrix = space.to_world.matrix @ read_training_alignment(self.provenance).matrix
             to_scene = Similarity(matrix)
-            positions = o.astype(float) @ matrix[:3, :3].T + matrix[:3, 3]
+            positions = transform_points(matrix, o.astype(float))
             vectors = d.astype(float) @ (matrix[:3, :3] / to_scene.scale).T
             instance = GazeFieldInstance(self.network, space.to_world)
             warn_extrapolation(reporter.warn, space.geometry, instance, np.unique(positions, axis=0))

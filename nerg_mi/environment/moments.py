@@ -11,6 +11,7 @@ import numpy as np
 from nerg_mi.errors import NergError, parameter, sanitize
 from nerg_mi.files.values import normalize_name, to_name
 from nerg_mi.maths.geometry import Similarity
+from nerg_mi.maths.transforms import transform_points
 from nerg_mi.maths.types import variant_types
 from nerg_mi.tracking.objects import ObjectPoses
 from nerg_mi.transport.mitsuba_mesh import pack_positions, positions_key, unpack_positions
@@ -81,7 +82,7 @@ class ShapeMover:
 def _move_points(rest: Any, matrix: np.ndarray | None) -> Any:
     """Return positions of a mesh that are moved by a matrix; all of them at the first one without a matrix."""
     points = np.array(unpack_positions(rest), np.float64).T
-    moved = np.repeat(points[:1], len(points), axis=0) if matrix is None else points @ matrix[:3, :3].T + matrix[:3, 3]
+    moved = np.repeat(points[:1], len(points), axis=0) if matrix is None else transform_points(matrix, points)
     return pack_positions(variant_types().Point3f(np.ascontiguousarray(moved.T, np.float32)))
 
 

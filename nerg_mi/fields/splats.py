@@ -14,6 +14,7 @@ import numpy as np
 
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.sphere import HARMONIC_DEGREES, SH_C0, rotate_harmonics
+from nerg_mi.maths.transforms import transform_points
 from nerg_mi.ranges import MAX_COORDINATE
 
 _MIN_SCALE = 1e-9
@@ -83,7 +84,7 @@ class Splats:
         if to_world.is_identity:
             return self
         turn = to_world.matrix[:3, :3] / to_world.scale
-        centers = self.centers @ to_world.matrix[:3, :3].T + to_world.matrix[:3, 3]
+        centers = transform_points(to_world.matrix, self.centers)
         rotations = multiply_quaternions(matrices_to_quaternions(turn), self.rotations.astype(np.float64))
         colors = rotate_harmonics(self.harmonics, turn)
         scales = self.scales * np.float32(to_world.scale)

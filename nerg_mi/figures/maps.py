@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError, parameter
+from nerg_mi.maths.transforms import transform_points
 from nerg_mi.tracking_kinds import TRACKING_NOTES
 
 from .style import (
@@ -64,8 +65,8 @@ def alignment_figure(
         Axes (2, 2) to draw in. Default: a new figure with its title.
     """
     grid = _grid_of(axes, (2, 2), 2 * _ALIGNMENT_SIDE, 2 * _ALIGNMENT_SIDE + 60)
-    moved = lambda p: p @ matrix[:3, :3].T + matrix[:3, 3]
-    rows = ((points, heads, "before"), (moved(points), None if heads is None else moved(heads), "after"))
+    moved_heads = None if heads is None else transform_points(matrix, heads)
+    rows = ((points, heads, "before"), (transform_points(matrix, points), moved_heads, "after"))
     for line, (p, h, when) in zip(grid, rows):
         for panel, (a, b), view in zip(line, ((0, 1), (0, 2)), ("from above", "from the side")):
             shown = place
@@ -157,9 +158,8 @@ def camera_figure(
         panel.scatter(points[:, a], points[:, b], s=1.5, c=colors / 255.0, linewidths=0, rasterized=True)
         panel.plot(centers[:, a], centers[:, b], color=_PATH, linewidth=0.6)
         for pose in to_world:
-            wedge = (np.array([[0, 0, 0], [-0.6, 0, -1], [0.6, 0, -1], [0, 0, 0]]) * size) @ pose[:3, :3].T + pose[
-                :3, 3
-            ]
+            corners = size * np.array([[0, 0, 0], [-0.6, 0, -1], [0.6, 0, -1], [0, 0, 0]])
+            wedge = transform_points(pose, corners)
             panel.plot(wedge[:, a], wedge[:, b], color=_CAMERA, linewidth=0.8)
         panel.set_aspect("equal")
         panel.set_title(name, fontsize=font_size(9), color=INK)

@@ -21,7 +21,7 @@ from nerg_mi.errors import sanitize
 from nerg_mi.fields.splats import quaternions_to_matrices
 from nerg_mi.files.safe_read import parse_json, translate_read_errors
 from nerg_mi.files.schema import INDEX, NUMBER, Items, Names, check_json
-from nerg_mi.maths.transforms import ROTATION_TOLERANCE, has_last_row
+from nerg_mi.maths.transforms import ROTATION_TOLERANCE, has_last_row, transform_points
 
 GLTF_MAGIC = b"glTF"  # first bytes of a file
 MAX_GLTF_BYTES = 1 << 30  # maximum size of a file in bytes
@@ -211,7 +211,7 @@ def parse_glb(raw: bytes | memoryview, path: str | os.PathLike) -> GltfTriangles
             triangles += len(index)
             if triangles > MAX_TRIANGLES:
                 raise ValueError(f"it has more than the {MAX_TRIANGLES:,} triangles, the limit")
-            vertices.append(corners @ matrix[:3, :3].T + matrix[:3, 3])
+            vertices.append(transform_points(matrix, corners))
             colors.append(_read_vertex_colors(document, data, primitive["attributes"], len(corners)))
             # A mirrored instance has the opposite winding order.
             faces.append(count + (index if np.linalg.det(matrix[:3, :3]) >= 0 else index[:, ::-1]))

@@ -41,6 +41,7 @@ from nerg_mi.formats.meshes import read_mesh_file
 from nerg_mi.formats.splats import read_splats
 from nerg_mi.formats.surfaces import extract_points
 from nerg_mi.maths.color import decode_srgb
+from nerg_mi.maths.transforms import transform_points
 from nerg_mi.progress import Progress, Reporter, open_reporter
 from nerg_mi.ranges import LENGTHS, POSITIVE_VALUES, Range, check_ranges
 from nerg_mi.registration import get_plugin_class
@@ -300,7 +301,7 @@ class _Builder:
         if isinstance(nerg.medium, FieldMedium) and isinstance(nerg.medium.field, RadianceNetwork):
             matrix = nerg.medium.to_world.matrix
             points = _surface_points(nerg.medium.field, "field", self.settings.max_points)
-            points = replace(points, positions=points.positions @ matrix[:3, :3].T + matrix[:3, 3])
+            points = replace(points, positions=transform_points(matrix, points.positions))
             self._add_points(points)
         if nerg.children.get("density") is not None:
             self.reporter.warn(

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from nerg_mi.maths.transforms import transform_points
+
 # Standard error of a matched position in pixels. COLMAP's own errors of a point are of this size or smaller, and those
 # of its poses are unknown.
 _PIXEL_ERROR = 1.0
@@ -34,7 +36,7 @@ class ObservedPoints:
 
     def transform(self, similarity: np.ndarray) -> ObservedPoints:
         """Transform the positions by ``similarity`` (4, 4)."""
-        return ObservedPoints(self.positions @ similarity[:3, :3].T + similarity[:3, 3], self.relative_errors)
+        return ObservedPoints(transform_points(similarity, self.positions), self.relative_errors)
 
 
 @dataclass(frozen=True)

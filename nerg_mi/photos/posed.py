@@ -18,7 +18,7 @@ from nerg_mi.errors import NergError, parameter, sanitize
 from nerg_mi.files.safe_read import is_regular_file, read_line_blocks, resolve_path
 from nerg_mi.files.values import parse_float
 from nerg_mi.maths.coordinates import check_near_origin
-from nerg_mi.maths.transforms import check_rigid_transforms, nearest_rotation
+from nerg_mi.maths.transforms import check_rigid_transforms, nearest_rotation, transform_points
 
 from .cameras import Intrinsics
 from .observed import ObservedPoints
@@ -311,7 +311,7 @@ class PosedImages:
             self,
             frames=frames,
             aabb=_transform_box(self.aabb, similarity),
-            points=None if self.points is None else self.points @ similarity[:3, :3].T + similarity[:3, 3],
+            points=None if self.points is None else transform_points(similarity, self.points),
             to_original=None if self.to_original is None else self.to_original @ back,
             to_file=self.to_file @ back,
         )
@@ -322,7 +322,7 @@ def _transform_box(box: np.ndarray | None, m: np.ndarray) -> np.ndarray | None:
     if box is None:
         return None
     corners = np.array([[box[k][a] for a, k in enumerate(pick)] for pick in np.ndindex(2, 2, 2)])
-    corners = corners @ m[:3, :3].T + m[:3, 3]
+    corners = transform_points(m, corners)
     return np.stack([corners.min(axis=0), corners.max(axis=0)])
 
 

@@ -30,7 +30,7 @@ from nerg_mi.errors import NergError, sanitize
 from nerg_mi.files.values import FilePath, to_name, to_names, to_numbers, to_path, to_seconds
 from nerg_mi.maths.coordinates import check_coordinates
 from nerg_mi.maths.geometry import Similarity
-from nerg_mi.maths.transforms import ROTATION_TOLERANCE, check_rigid_transforms, similarity_scale
+from nerg_mi.maths.transforms import ROTATION_TOLERANCE, check_rigid_transforms, similarity_scale, transform_points
 from nerg_mi.tracking.rays import Rays
 from nerg_mi.tracking.readers.columns import PERSON_NAMES, ColumnFinder, parse_time_unit
 from nerg_mi.tracking.readers.tables import iterate_table
@@ -276,8 +276,8 @@ class ObjectPoses:
         linear = m[:3, :3] / similarity_scale(m)
         turns = np.where(np.isfinite(self.quaternions).all(axis=1, keepdims=True), self.quaternions, (0, 0, 0, 1))
         turned = linear @ Rotation.from_quat(turns).as_matrix() @ linear.T
-        positions = self.positions @ m[:3, :3].T + m[:3, 3]
-        return replace(self, positions=positions, quaternions=Rotation.from_matrix(turned).as_quat())
+        quaternions = Rotation.from_matrix(turned).as_quat()
+        return replace(self, positions=transform_points(m, self.positions), quaternions=quaternions)
 
     @cached_property
     def _tracks(self) -> dict[tuple[str, str], _Track]:

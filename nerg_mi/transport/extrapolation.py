@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.maths.transforms import transform_points
 
 from .geometry import SURFACE_OPACITY, SceneGeometry, shape_corners, trace_depth
 from .mitsuba_mesh import count_faces, is_mesh, read_triangles
@@ -49,15 +50,14 @@ def find_extrapolation(
     if support is not None and gaze is not None:
         from scipy.spatial import KDTree
 
-        to_local = gaze.to_world.inverse
-        local = positions @ to_local[:3, :3].T + to_local[:3, 3]
+        local = transform_points(gaze.to_world.inverse, positions)
         distance = KDTree(support.cells[:, :3].astype(np.float64)).query(local)[0]
         for k in np.flatnonzero(distance > support.cutoff):
             reasons[k] = f"is {distance[k] * gaze.to_world.scale:.3g} from the nearest recorded position"
     bounds = None if geometry is None else geometry.bounds()
     if bounds is None and gaze is not None:
         corners = np.array([gaze.field.box.lower, gaze.field.box.upper], np.float64)
-        placed = corners @ gaze.to_world.matrix[:3, :3].T + gaze.to_world.matrix[:3, 3]
+        placed = transform_points(gaze.to_world.matrix, corners)
         bounds = placed.min(axis=0), placed.max(axis=0)
     if bounds is None:
         return reasons

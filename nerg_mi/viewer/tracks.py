@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nerg_mi.maths.geometry import Similarity
+from nerg_mi.maths.transforms import transform_points
 from nerg_mi.tracking.probes import place_probes
 from nerg_mi.tracking.rays import Rays
 
@@ -60,7 +61,7 @@ class Tracks:
         self._rays = rays.select(order)
         matrix = self._matrix = np.asarray(align.matrix, float)
         rotation = matrix[:3, :3] / align.scale
-        self.origins = self._rays.origin @ matrix[:3, :3].T + matrix[:3, 3]
+        self.origins = transform_points(matrix, self._rays.origin)
         self.directions = self._rays.direction @ rotation.T
 
     @property
@@ -136,8 +137,7 @@ class Tracks:
         """
         rows = np.flatnonzero(self._group_mask(group))
         probes = place_probes(self._rays.select(rows), count=MAX_PROBES)
-        linear, shift = self._matrix[:3, :3], self._matrix[:3, 3]
-        return probes.positions @ linear.T + shift, probes.counts
+        return transform_points(self._matrix, probes.positions), probes.counts
 
     def _group_mask(self, group: str) -> np.ndarray:
         if group == ALL_PARTICIPANTS or self._rays.cohort is None:

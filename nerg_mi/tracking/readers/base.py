@@ -20,6 +20,7 @@ from nerg_mi.files.atomic import file_sha256
 from nerg_mi.files.safe_read import BadLineCallback, check_regular_file
 from nerg_mi.files.values import normalize_name, to_name
 from nerg_mi.maths.coordinates import check_near_origin
+from nerg_mi.maths.transforms import transform_points
 from nerg_mi.ranges import IS_OPTION, MAX_COORDINATE, RANGE, TIME_UNITS, Range, ValidatedDataclass
 from nerg_mi.tracking.rays import COLUMNS, FRAME, Rays, merge_tracking
 
@@ -411,7 +412,7 @@ class RaysBuilder:
     def _to_rays_frame(self, points: np.ndarray) -> np.ndarray:
         """Transform ``points`` (N, 3) to the common frame."""
         with np.errstate(over="ignore", invalid="ignore"):
-            return points @ self._transform[:3, :3].T + self._transform[:3, 3]
+            return transform_points(self._transform, points)
 
     def _record_dropped(self, reason: str, rows: np.ndarray) -> None:
         name = self._sources[-1]["file"] if self._sources else ""
