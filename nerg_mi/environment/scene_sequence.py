@@ -100,6 +100,8 @@ class SceneSequence:
         except (NergError, RuntimeError):
             # Loading the whole scene raises the error again, in other words.
             return False
+        # Without a scene until all of them are moved, so that an error leaves none that is moved in part.
+        scene, self._scene = self._scene, None
         for index, old, new in zip(indices, sensors, moved):
             if index in changed:
                 target, source = mi.traverse(old), mi.traverse(new)
@@ -108,7 +110,7 @@ class SceneSequence:
                 target.update()
         if has_observer:
             integrator.parameters_changed(["observer.to_world"])
-        self._nodes = state.nodes
+        self._scene, self._nodes = scene, state.nodes
         return True
 
     def _load_sensors(self, values: Mapping[str, str]) -> list[Any]:

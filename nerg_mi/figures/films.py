@@ -470,26 +470,33 @@ def _render_in_parts(
 
 
 @contextmanager
-def _open_part(settings: FrameSettings, scene: PlannedFiles) -> Iterator[tuple[SceneSequence, FrameRenderer]]:
-    """Yield the scene of a part, and what renders it."""
-    source = SceneSequence(scene.checked_path(), scene.defaults)
+def _open_part(settings: FrameSettings, scene: PlannedFiles) -> Iterator[tuple[FrameRenderer, FilmProvenance]]:
+    """Yield what renders a part, with the scene of the last one: no file changes during a job (`run_task`)."""
+    from nerg_mi.tasks.execution import prepare_once
+
     activate_variant(settings.mode)
+    path, opened = scene.checked_path(), prepare_once(settings, dict[Path, tuple[SceneSequence, FilmProvenance]])
+    if path not in opened:
+        # A single scene, whose memory is free before the next one is read.
+        opened.clear()
+        opened[path] = (source := SceneSequence(path), FilmProvenance(source, settings))
+    source, provenance = opened[path]
     with Interruption() as stop:
-        yield source, FrameRenderer(source, settings, 1, SILENT, stop)
+        yield FrameRenderer(source, settings, 1, SILENT, stop), provenance
         stop.check()
 
 
 def make_picture(settings: FrameSettings, scene: PlannedFiles, output: Path) -> dict[str, Any]:
     """Write the image of a frame."""
-    with _open_part(settings, scene) as (source, renderer):
-        renderer.render({}, FilmProvenance(source, settings)).save(output)
+    with _open_part(settings, scene) as (renderer, provenance):
+        renderer.render(scene.defaults, provenance).save(output)
     return _describe_part(renderer)
 
 
 def make_layers(settings: FrameSettings, scene: PlannedFiles, output: Path) -> dict[str, Any]:
     """Write the colour and the AOV of an image (.npy), and return what its colour scale depends on."""
-    with _open_part(settings, scene) as (_, renderer):
-        layers = renderer.render_layers({})
+    with _open_part(settings, scene) as (renderer, _):
+        layers = renderer.render_layers(scene.defaults)
     StoredLayers.store(output, layers)
     notes = {"marker": layers.marker, "supported": bool(layers.has_support), "basis": layers.support_note}
     return _describe_part(renderer) | notes | {"limits": find_overlay(settings.overlay or "").limits(layers)}

@@ -23,7 +23,7 @@ from typing import Any
 from nerg_mi.errors import NergError
 
 from .cluster import MAX_WORKER_WAIT, ClusterEngine
-from .execution import MAX_ATTEMPTS, Engine, TaskResult, WarningCallback, run_task
+from .execution import MAX_ATTEMPTS, Engine, TaskResult, WarningCallback, release_prepared, run_task
 from .store import ResultManifest, Store
 from .task import Checksums, Plan, SharedContext, Task
 
@@ -78,8 +78,11 @@ class LocalEngine:
         self, shared: SharedContext, tasks: Sequence[Task], store: Store, warn: WarningCallback
     ) -> Generator[TaskResult]:
         checksums = Checksums()
-        for task in tasks:
-            yield TaskResult(task, _run_and_store(store, shared, task, checksums))
+        try:
+            for task in tasks:
+                yield TaskResult(task, _run_and_store(store, shared, task, checksums))
+        finally:
+            release_prepared()
 
 
 # ---- Processes of this machine ----

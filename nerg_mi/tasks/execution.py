@@ -59,6 +59,11 @@ def prepare_once(common: Any, factory: Callable[[], Any]) -> Any:
     return _prepared_common[0][1]
 
 
+def release_prepared() -> None:
+    """Release what `prepare_once` has cached."""
+    _prepared_common.clear()
+
+
 def run_task(shared: SharedContext, task: Task, output: Path, checksums: Checksums, threads: int = 0) -> ResultManifest:
     """Run ``task``, which writes ``output``, and return its manifest.
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from nerg_mi.scenes.store import SCENE_FILE
 
-from nerg_mi.environment import bands
+from nerg_mi.environment import bands, scene_sequence
 from nerg_mi.environment.bands import render_aovs
 from nerg_mi.environment.planned import PlannedFiles
 from nerg_mi.environment.scene_loading import load_scene
@@ -373,6 +373,30 @@ def test_stored_images_are_not_rendered_again(scene, monkeypatch):
     scene.write_text(BALL.replace("0.3", "0.31"))
     film_of(scene, "four", "a.png", store=store)
     assert len(rendered) == 7 and files(scene.parent / "four") != files(scene.parent / "three")
+
+
+@pytest.mark.parametrize("overlay", [None, "gaze"])
+def test_parts_read_their_scene_once(rgb, scene_overlays, tmp_path, monkeypatch, overlay):
+    """In any order, while only cameras and observers move; and again in the next job, since a file may change."""
+    read, scene = [], shutil.copytree(scene_overlays.parent, tmp_path / "scene") / "scene.xml"
+    monkeypatch.setattr(scene_sequence, "load_scene", lambda *args, **more: read.append(1) or load_scene(*args, **more))
+    eyes = [{"eye": f"{x}, 0.1, -2.5"} for x in (0.2, -1.5, -0.6, 0.9)]
+    options = {"spp": 1, "overlay": overlay, "vmax": None if overlay is None else 0.3}
+
+    def render(frames, name):
+        parallel = Parallel(store=tmp_path / f"{name}.tasks")
+        render_film(scene, tmp_path / name / "a.png", frames=frames, parallel=parallel, **options)
+        return [path.read_bytes() for path in sorted((tmp_path / name).glob("*.png"))]
+
+    first = render(eyes, "first")
+    assert len(read) == 1
+    assert render(eyes[::-1], "second") == first[::-1] and len(set(first)) == 4
+    assert len(read) == 2
+    scene.write_text(OVERLAYS_SCENE.replace('value="40"', 'value="30"'))
+    assert not set(render(eyes, "third")) & set(first)
+    assert len(read) == 3
+    whole = render_film(scene, tmp_path / "whole" / "a.png", frames=eyes, **options).files
+    assert [path.read_bytes() for path in whole] == render(eyes, "third")
 
 
 def test_ctrl_c_reports_how_to_resume(scene):
