@@ -81,15 +81,15 @@ def iter_hit_groups(
     Rays end at ``max_distance`` (N,) and when their transmittance falls to ``min_transmittance``. Use `send` to pass
     the rows of the last group that should continue.
     """
-    hits, order = SplatHits(arrays), np.array(arrays.order).astype(np.int64)
+    hits = SplatHits(arrays)
     rows, ends = (
         np.arange(len(origins)),
         np.full(len(origins), np.inf) if max_distance is None else np.asarray(max_distance),
     )
-    light, last, tree_index = np.ones(len(origins)), np.full(len(origins), -1e-37), np.zeros(len(origins), np.int64)
+    light, last, last_index = np.ones(len(origins)), np.full(len(origins), -1e-37), np.zeros(len(origins), np.int64)
     while len(rows):
-        t, absorbed, tree_places = _next_hits(
-            hits, origins[rows], directions[rows], (last, tree_index), ends[rows], light, min_transmittance
+        t, absorbed, index = _next_hits(
+            hits, origins[rows], directions[rows], (last, last_index), ends[rows], light, min_transmittance
         )
         is_hit = np.isfinite(t)
         absorbed = np.where(is_hit, absorbed, 0.0)
@@ -99,15 +99,14 @@ def iter_hit_groups(
         is_active = is_hit[:, -1] & (left > min_transmittance)
         # A group also ends when the transmittance is too low.
         through = ~is_active & (left > min_transmittance)
-        index = np.where(is_hit, order[np.where(is_hit, tree_places, 0)], -1)
-        requested_rows = yield HitGroup(rows, index, arriving, absorbed, left, through)
+        requested_rows = yield HitGroup(rows, np.where(is_hit, index, -1), arriving, absorbed, left, through)
         if requested_rows is not None:
             is_active &= np.isin(rows, requested_rows)
-        rows, light, last, tree_index = rows[is_active], left[is_active], t[is_active, -1], tree_places[is_active, -1]
+        rows, light, last, last_index = rows[is_active], left[is_active], t[is_active, -1], index[is_active, -1]
 
 
 def _next_hits(hits, origins, directions, after, before, light, stop) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return distance, opacity and tree index (M, K) of the next hits; distances are infinite without a hit."""
+    """Return distance, opacity and index (M, K) of the next hits; distances are infinite without a hit."""
     mi = variant_types()
     o, d = to_vector(mi.Point3f, origins), to_vector(mi.Vector3f, directions)
     count = len(origins)

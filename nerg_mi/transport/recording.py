@@ -38,8 +38,8 @@ class State:
     """All that ``roots`` contain, in a fixed order.
 
     Attributes of Python objects are followed, except those that their class names in ``UNRECORDED``: attributes that no
-    traced program reads, or that it reads only with derivatives. Of objects of Mitsuba that are written in C++, Dr.Jit
-    lists the arrays.
+    traced program reads, or that it reads only with derivatives. Those in ``COMPUTED``, which are computed when first
+    read, are read before. Of objects of Mitsuba that are written in C++, Dr.Jit lists the arrays.
 
     Attributes
     ----------
@@ -167,6 +167,8 @@ def _visit_object(state: State, value: Any) -> None:
         kind, key = type(value), state.key
         key.append(kind)
         unrecorded = getattr(kind, "UNRECORDED", ())
+        for name in getattr(kind, "COMPUTED", ()):
+            getattr(value, name)
         for name, item in value.__dict__.items():
             if name not in unrecorded:
                 key.append(name)
@@ -403,8 +405,8 @@ class Recorder:
 
 
 class FrozenChildren:
-    """Exposes the ``objects`` of an integrator to ``dr.freeze``, except to the ``recorder``, which knows what it reads:
-    it takes Dr.Jit longer to list all their arrays than to replay a small image."""
+    """Exposes the ``objects`` of an integrator to ``dr.freeze`` alone, and not to the ``recorder``, which knows what it
+    reads: it takes Dr.Jit longer to list all their arrays than to replay a small image."""
 
     DRJIT_STRUCT: ClassVar[dict[str, None]] = {"exposed": None}
 
@@ -413,7 +415,9 @@ class FrozenChildren:
 
     @property
     def exposed(self) -> dict[str, Any]:
-        return {} if self._recorder.is_replaying else self.objects
+        # Otherwise, Dr.Jit passes the integrator to an operation with derivatives, and would list them twice a step.
+        is_frozen = dr.flag(dr.JitFlag.EnableObjectTraversal)
+        return self.objects if is_frozen and not self._recorder.is_replaying else {}
 
     @exposed.setter
     def exposed(self, value: dict[str, Any]) -> None:

@@ -133,7 +133,7 @@ class SplatLists(SplatHits):
         return _Rectangles(*(v.numpy() for v in values))
 
     def _sort_visible(self, is_visible: np.ndarray) -> np.ndarray:
-        """Indices of the Gaussians that any cell shows, in tree order, sorted by the distance of their centres."""
+        """Indices of the Gaussians that any cell shows, sorted by the distance of their centres."""
         ns, (index,) = self._ns, np.nonzero(is_visible)
         if len(index) == 0:
             return index

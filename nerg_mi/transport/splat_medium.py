@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from types import ModuleType
 from typing import Any, ClassVar, cast
 
 import drjit as dr
 import numpy as np
 
-from nerg_mi.fields.splats import Splats, quaternions_to_matrices
+from nerg_mi.fields.splats import Splats
 from nerg_mi.maths.arrays import copy_aligned
 from nerg_mi.maths.geometry import Similarity, intersect_box
 from nerg_mi.maths.types import Array3f, Bool, Color, Float, Point3f, UInt32, Vector3f
@@ -37,24 +38,22 @@ _MARGIN_REL = np.float32(1e-6)
 class BoxTree:
     """A tree over N boxes."""
 
-    # Index of the box at each position in tree order, (N,) int64.
-    order: np.ndarray
     # Nodes from number 1 on, (2 leaves, NODE_SIZE) float32; an empty node is a point beyond all distances.
     nodes: np.ndarray
-    # Position in tree order of each leaf's box, (leaves,) uint32.
-    places: np.ndarray
+    # Index of each leaf's box, (leaves,) uint32; 0 for an empty leaf.
+    boxes: np.ndarray
 
-    @property
-    def leaves(self) -> int:
-        """Number of leaves, a power of 2."""
-        return len(self.places)
+
+def count_levels(count: int) -> int:
+    """Number of levels below the root of the tree of ``count`` boxes, which has two to this power leaves."""
+    return max(count - 1, 0).bit_length()
 
 
 def build_tree(lower: np.ndarray, upper: np.ndarray) -> BoxTree:
     """Build the tree of N boxes with finite corners ``lower`` and ``upper``, (N, 3) each."""
     lower, upper = (np.asarray(v, np.float32) for v in (lower, upper))
     n = len(lower)
-    depth = max(n - 1, 0).bit_length()
+    depth = count_levels(n)
     centers = 0.5 * (lower.astype(np.float64) + upper)
     nodes = np.zeros((2 << depth, NODE_SIZE), np.float32)
     order, part, sizes = np.arange(n), np.zeros(n, np.int64), np.array([n])
@@ -75,8 +74,8 @@ def build_tree(lower: np.ndarray, upper: np.ndarray) -> BoxTree:
         sizes = np.stack([left, sizes - left], axis=1).ravel()
         part = np.repeat(np.arange(len(sizes)), sizes)
     leaves = 1 << depth
-    places = np.zeros(leaves, np.uint32)
-    places[part] = np.arange(n)
+    boxes = np.zeros(leaves, np.uint32)
+    boxes[part] = order
     wider = _MARGIN_REL * np.maximum(np.abs(lower), np.abs(upper))
     nodes[:, :3], nodes[:, 3:6] = _OUTSIDE, -_OUTSIDE
     nodes[leaves + part, :3], nodes[leaves + part, 3:6] = (lower - wider)[order], (upper + wider)[order]
@@ -86,7 +85,7 @@ def build_tree(lower: np.ndarray, upper: np.ndarray) -> BoxTree:
         nodes[level_centers, 3:6] = np.maximum(below[::2, 3:6], below[1::2, 3:6])
     # An inverted box would be sorted like any other; a distant point is never hit.
     nodes[nodes[:, 0] > nodes[:, 3], :6] = _OUTSIDE
-    return BoxTree(order, nodes, places)
+    return BoxTree(nodes, boxes)
 
 
 # ---- Arrays ----
@@ -101,7 +100,6 @@ MAX_ALPHA = 0.9999
 """Maximum fraction of light that one Gaussian absorbs, as in Mitsuba's ``volprim_rf_basic``."""
 
 _PARAMETERS = ("centers", "scales", "rotations", "opacities", "harmonics")
-_KERNEL_ARRAYS = ("shapes", "colors", "nodes", "places", "order", "corners")
 
 
 class SplatArrays:
@@ -109,12 +107,14 @@ class SplatArrays:
 
     ``namespace``: of the arrays' backend. The attributes ``centers``, ``scales``, ``rotations`` (w first),
     ``opacities`` and ``harmonics`` are flat Floats in the order of ``splats``; call `pack` after changing them. It
-    derives, differentiably, what kernels read, in tree order: ``shapes`` and ``colors``; ``nodes`` and ``places``: see
-    `BoxTree`; ``corners``: lower and upper corner of all Gaussians, 6 one-lane Floats.
+    derives, differentiably, what kernels read: ``shapes`` and ``colors``; ``corners``: lower and upper corner of all
+    Gaussians, 6 one-lane Floats. The ``tree`` is built when it is first read: lists do without it.
     """
 
-    # Lets Dr.Jit find the arrays in frozen functions.
-    DRJIT_STRUCT: ClassVar[dict[str, Any]] = dict.fromkeys((*_PARAMETERS, *_KERNEL_ARRAYS))
+    # Lets Dr.Jit find the arrays in frozen functions, which read the tree.
+    DRJIT_STRUCT: ClassVar[dict[str, Any]] = dict.fromkeys((*_PARAMETERS, "shapes", "colors", "corners", "tree"))
+    UNRECORDED = ("_boxes",)
+    COMPUTED = ("tree",)
 
     centers: Float
     scales: Float
@@ -126,6 +126,7 @@ class SplatArrays:
         self.namespace, self.count, self.extent = ns, len(splats), float(extent)
         self.rows = ns.ArrayXf
         self.terms = splats.harmonics.shape[1]
+        self.leaves = 1 << count_levels(self.count)
         # Arrays are gathered in packets of four.
         self._stride = -(-3 * self.terms // 4) * 4
         for name in _PARAMETERS:
@@ -139,25 +140,8 @@ class SplatArrays:
     def pack(self) -> None:
         """Derive from the parameters what kernels read."""
         ns, n = self.namespace, self.count
-        centers, scales, rotations = (
-            np.array(dr.detach(getattr(self, name)), np.float64).reshape(n, -1) for name in _PARAMETERS[:3]
-        )
-        rotations /= np.linalg.norm(rotations, axis=1, keepdims=True)
-        # The half extents of an ellipsoid are the lengths of its matrix rows.
-        half = self.extent * np.sqrt(((quaternions_to_matrices(rotations) * scales[:, None]) ** 2).sum(axis=2))
-        tree = build_tree(centers - half, centers + half)
-        self.lower, self.upper = (centers - half).min(axis=0), (centers + half).max(axis=0)
-        # Opaque: as literals they would compile a new kernel each time a Gaussian moves.
-        self.corners = [dr.opaque(ns.Float, float(v)) for v in (*self.lower, *self.upper)]
-        self.thickness = float(np.median(scales.min(axis=1)))
-        self.leaves = tree.leaves
-        # Always the same alignment: frozen functions distinguish arrays by it and would be recorded again.
-        self.nodes, self.places = (
-            ns.Float(copy_aligned(tree.nodes).ravel()),
-            ns.UInt32(copy_aligned(tree.places, np.uint32).ravel()),
-        )
-        order = ns.UInt32(copy_aligned(tree.order, np.uint32).ravel())
-        take = lambda values, width: [dr.gather(ns.Float, values, order * width + i) for i in range(width)]
+        index = dr.arange(ns.UInt32, n)
+        take = lambda values, width: [dr.gather(ns.Float, values, index * width + i) for i in range(width)]
         c, s, q = take(self.centers, 3), take(self.scales, 3), take(self.rotations, 4)
         inverse = dr.rcp(dr.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]))
         w, x, y, z = (v * inverse for v in q)
@@ -172,12 +156,33 @@ class SplatArrays:
         color = take(self.harmonics, 3 * self.terms)
         color += [zeros] * (self._stride - len(color))
         self.shapes, self.colors = dr.ravel(ns.ArrayXf(shape)), dr.ravel(ns.ArrayXf(color))
-        # Positions in the order of the parameters, to look up a Gaussian there.
-        self.order = order
-        dr.eval(self.shapes, self.colors, self.nodes, self.places)
+        with dr.suspend_grad():
+            # The half extents of an ellipsoid are the lengths of the rows of its matrix.
+            half = ns.Array3f(*(dr.norm(ns.Array3f(*(s[k] * axes[k][i] for k in range(3)))) for i in range(3)))
+            self._boxes = ns.Array3f(*c) - self.extent * half, ns.Array3f(*c) + self.extent * half
+            thickness = dr.minimum(dr.minimum(s[0], s[1]), s[2])
+            dr.eval(self.shapes, self.colors, self._boxes, thickness)
+            # Arrays, and no literals, which would compile a new kernel each time a Gaussian moves.
+            self.corners = [*dr.min(self._boxes[0], axis=1), *dr.max(self._boxes[1], axis=1)]
+            dr.eval(self.corners)
+        self.lower, self.upper = np.array(self.corners, np.float64).reshape(2, 3)
+        self.thickness = float(np.median(thickness.numpy()))
+        # That of other values.
+        vars(self).pop("tree", None)
+
+    @cached_property
+    def tree(self) -> list[Any]:
+        """``nodes`` and ``boxes`` of the `BoxTree` of the Gaussians."""
+        # Evaluated components, since the first ray may ask in a symbolic loop.
+        tree = build_tree(*(np.stack([v.numpy() for v in corner], axis=1) for corner in self._boxes))
+        # Always the same alignment: frozen functions distinguish arrays by it and would be recorded again.
+        return [
+            self.namespace.Float(copy_aligned(tree.nodes).ravel()),
+            self.namespace.UInt32(copy_aligned(tree.boxes, np.uint32)),
+        ]
 
     def find_peak(self, index: UInt32, o: Any, d: Any, active: Bool) -> tuple[Float, Float, Float]:
-        """``(t, absorbed, distance)`` of the Gaussian ``index`` (in tree order) on the ray ``o + t d``.
+        """``(t, absorbed, distance)`` of the Gaussian ``index`` on the ray ``o + t d``.
 
         ``t``: where the Gaussian is densest along the ray; ``absorbed``: the fraction of light absorbed, all of it
         there; ``distance``: squared distance to the centre at that point, in standard deviations.
@@ -189,7 +194,7 @@ class SplatArrays:
         return find_peak(from_center, along, g[12])
 
     def color(self, index: UInt32, w: Vector3f, active: Bool) -> Color:
-        """Colour of the Gaussian ``index`` (in tree order) for the unit ray direction ``w``: a list of three."""
+        """Colour of the Gaussian ``index`` for the unit ray direction ``w``: a list of three."""
         c = dr.gather(self.namespace.ArrayXf, self.colors, index, active, shape=(self._stride, dr.width(index)))
         values = dr.sh_eval(w, round(self.terms**0.5) - 1)
         sums = [self.namespace.Float(0.5)] * 3
@@ -250,6 +255,7 @@ class SplatHits:
     ) -> NextHits:
         """See `medium.Hits`."""
         a, o, d = self.arrays, ray.o, ray.d
+        nodes, boxes = a.tree
         Float = type(before)
         UInt32: Any = dr.uint32_array_t(Float)
         # Axes without a direction component never decide, unless the ray is outside the box.
@@ -257,7 +263,7 @@ class SplatHits:
         origin = (o.x, o.y, o.z)
 
         def test(walk: _TreeWalk) -> _TreeWalk:
-            index = dr.gather(UInt32, a.places, walk.node - a.leaves, walk.active)
+            index = dr.gather(UInt32, boxes, walk.node - a.leaves, walk.active)
             t, absorbed, distance = a.find_peak(index, o, d, walk.active)
             behind = (t > after.t) | ((t == after.t) & (index > after.index))
             is_candidate = walk.active & behind & (distance < a.extent**2) & (t < walk.far) & (t < before)
@@ -278,7 +284,7 @@ class SplatHits:
 
         def step(walk: _TreeWalk) -> _TreeWalk:
             shape = (NODE_SIZE, dr.width(walk.node))
-            box = dr.gather(a.rows, a.nodes, walk.node, walk.active, shape=shape)
+            box = dr.gather(a.rows, nodes, walk.node, walk.active, shape=shape)
             near, far = dr.maximum(after.t, 0), walk.far
             for i in range(3):
                 t0, t1 = (box[i] - origin[i]) * inverse[i], (box[i + 3] - origin[i]) * inverse[i]

@@ -567,6 +567,22 @@ def test16_observers_of_media(rgb, files, kind, monkeypatch):
         ask()
 
 
+def test18_gaussians_that_exchange_their_places_are_replayed(rgb, files, count_traces):
+    """All bounds stay, and with them the recording, which reads another tree."""
+    some = random_splats(60, degree=1)
+    scales, rotations = np.full((60, 3), 0.2), np.tile([1, 0, 0, 0], (60, 1))
+    write_ply_splats(files / "splats.ply", replace(some, scales=scales, rotations=rotations))
+    scene, images, before = make_medium_scene(rgb, files, "tree"), [], count_traces()
+    for _ in range(6):
+        params = rgb.traverse(scene)
+        centers = np.array(params["integrator.field.centers"]).reshape(60, 3)
+        put(params, "integrator.field.centers", rgb.Float(np.roll(centers, 1, axis=0).ravel()))
+        images.append(render_both(rgb, scene, 0))
+    assert np.abs(np.diff(images, axis=0)).max(axis=(1, 2, 3)).min() > 0.01
+    # Mitsuba traces each image.
+    assert count_traces() <= before + 6 + 3
+
+
 # ---- What cannot be recorded ----
 
 

@@ -310,6 +310,23 @@ def test11_frozen_training_matches(rgb, files, names):
     assert frozen.n_recordings <= 3
 
 
+def test11b_frozen_images_follow_changed_gaussians(rgb):
+    """Without another image that reads them before."""
+    scene, center = splat_scene(rgb), "integrator.field.centers"
+    params = rgb.traverse(scene)
+    start = rgb.Float(params[center])
+    frozen = dr.freeze(lambda scene: rgb.render(scene, spp=1))
+    images = []
+    for i in range(4):
+        put(params, center, shifted(rgb, start, i))
+        images.append(np.array(frozen(scene)))
+    assert frozen.n_recordings < 4
+    for i, image in enumerate(images):
+        put(params, center, shifted(rgb, start, i))
+        np.testing.assert_allclose(image, rgb.render(scene, spp=1), atol=2e-6)
+    assert not np.allclose(images[2], images[3], atol=1e-4)
+
+
 def test12_changing_gaussians_in_a_frozen_function_is_refused(rgb):
     scene = splat_scene(rgb)
     params = rgb.traverse(scene)

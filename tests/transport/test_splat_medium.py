@@ -12,7 +12,7 @@ from nerg_mi.fields.splats import Splats, harmonics_from_colors
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.sphere import eval_harmonics
 from nerg_mi.transport.medium import LastHit
-from nerg_mi.transport.splat_medium import GROUP_SIZE, SplatArrays, SplatMedium, build_tree
+from nerg_mi.transport.splat_medium import GROUP_SIZE, SplatArrays, SplatMedium, build_tree, count_levels
 from tests.formats.splats.writers import random_splats
 from tests.reference.splats import peaks
 
@@ -45,13 +45,12 @@ def test_peaks_and_colors_match_float64():
     splats = random_splats(30, degree=3)
     arrays = SplatArrays(splats, ns)
     o, d = rays(200)
-    place = np.random.default_rng(0).integers(0, 30, 200)
-    index = np.array(arrays.order)[place]
-    t, absorbed, distance = arrays.find_peak(ns.UInt32(place), ns.Array3f(o.T), ns.Array3f(d.T), True)
+    index = np.random.default_rng(0).integers(0, 30, 200)
+    t, absorbed, distance = arrays.find_peak(ns.UInt32(index), ns.Array3f(o.T), ns.Array3f(d.T), True)
     wanted = [v[np.arange(200), index] for v in peaks(splats, o, d, extent=np.inf)]
     assert np.allclose(t, wanted[0], atol=1e-5) and np.allclose(absorbed, wanted[1], atol=1e-5)
     assert np.allclose(np.minimum(splats.opacities[index] * np.exp(-0.5 * np.array(distance)), 0.9999), wanted[1])
-    color = np.stack([np.array(c) for c in arrays.color(ns.UInt32(place), ns.Array3f(d.T), True)], axis=1)
+    color = np.stack([np.array(c) for c in arrays.color(ns.UInt32(index), ns.Array3f(d.T), True)], axis=1)
     seen = np.einsum("rk,rkc->rc", eval_harmonics(d, 3), splats.harmonics[index].astype(float)) + 0.5
     assert np.allclose(color, np.maximum(seen, 0), atol=1e-5)
 
@@ -86,9 +85,9 @@ def test_placed_medium_matches_transformed_splats(rgb):
     make = []
     for medium in (placed, moved):
         ray = medium.ray_to_local(rgb.Point3f((2.5 * o).T), rgb.Vector3f(d.T))
-        index = np.argsort(np.array(medium.arrays.order))[np.arange(50) % 20]
-        t, share = medium.hits.reevaluate(ray, rgb.UInt32(index), True)
-        color = medium.color([rgb.UInt32(index)], None, ray.w, True)
+        index = rgb.UInt32(np.arange(50) % 20)
+        t, share = medium.hits.reevaluate(ray, index, True)
+        color = medium.color([index], None, ray.w, True)
         make.append(np.stack([np.array(v) for v in (t, share, *color)]))
     assert np.allclose(make[0], make[1], rtol=1e-3, atol=1e-4)
 
@@ -129,6 +128,21 @@ def test_groups_follow_the_global_order(rgb):
     assert np.array_equal(np.array(again[1])[first], np.array(result.absorbed[0])[first])
 
 
+def test_hits_follow_changes_of_the_parameters(rgb):
+    medium, (o, d) = medium_of(random_splats(80, degree=0, size=0.3)), rays(300)
+    after, everywhere = LastHit(rgb.Float(0), rgb.UInt32(0)), dr.full(rgb.Bool, True, 300)
+    for seed in range(3):
+        splats = random_splats(80, degree=0, seed=seed, size=0.3)
+        for name in ("centers", "scales", "rotations", "opacities"):
+            setattr(medium.arrays, name, rgb.Float(getattr(splats, name).ravel()))
+        medium.arrays.pack()
+        ray = medium.ray_to_local(rgb.Point3f(o.T), rgb.Vector3f(d.T))
+        result = medium.hits.find_next(ray, after, ray.t_far, rgb.Float(1), rgb.Float(0), everywhere)
+        t, share = peaks(splats, o, d)
+        wanted = np.where((share > 0) & (t > 0), t, np.inf).min(axis=1)
+        np.testing.assert_allclose(result.t[0], wanted, atol=1e-5)
+
+
 def test_coincident_peaks_are_all_returned(rgb):
     count = 2 * GROUP_SIZE + 3
     medium = medium_of(stack([1.0] * count, np.full(count, 0.1)))
@@ -161,12 +175,11 @@ def test_boxes_are_in_one_leaf_and_its_ancestors(count):
     lower = rng.normal(size=(count, 3))
     upper = lower + rng.uniform(0, 0.3, (count, 3))
     tree = build_tree(lower, upper)
-    assert sorted(tree.order) == list(range(count)) and count <= tree.leaves < 2 * count + (count == 1)
-    leaf = tree.nodes[tree.leaves :]
-    held = leaf[:, 0] < 1e29
-    assert sorted(tree.places[held]) == list(range(count))
-    for node, place in zip(np.flatnonzero(held) + tree.leaves, tree.places[held]):
-        i = tree.order[place]
+    leaves = 1 << count_levels(count)
+    assert len(tree.nodes) == 2 * leaves and count <= leaves < 2 * count + (count == 1)
+    is_held = tree.nodes[leaves:, 0] < 1e29
+    assert sorted(tree.boxes[is_held]) == list(range(count))
+    for node, i in zip(np.flatnonzero(is_held) + leaves, tree.boxes[is_held]):
         while node:
             assert (tree.nodes[node, :3] <= lower[i]).all() and (upper[i] <= tree.nodes[node, 3:6]).all()
             node //= 2
@@ -174,12 +187,12 @@ def test_boxes_are_in_one_leaf_and_its_ancestors(count):
 
 def test_coincident_boxes():
     tree = build_tree(np.zeros((9, 3)), np.ones((9, 3)))
-    assert sorted(tree.order) == list(range(9)) and tree.nodes[1, :6].round(3).tolist() == [0, 0, 0, 1, 1, 1]
+    assert sorted(tree.boxes)[-9:] == list(range(9)) and tree.nodes[1, :6].round(3).tolist() == [0, 0, 0, 1, 1, 1]
 
 
 def test_empty_nodes_are_never_hit():
     tree = build_tree(np.zeros((5, 3)), np.ones((5, 3)))
-    empty = tree.nodes[tree.leaves :][~np.isin(np.arange(8), np.flatnonzero(tree.nodes[tree.leaves :, 0] < 1))]
+    empty = tree.nodes[8:][tree.nodes[8:, 0] >= 1]
     assert len(empty) == 3 and (empty[:, :6] == np.float32(1e30)).all()
 
 
@@ -187,4 +200,4 @@ def test_nodes_split_along_the_longest_side():
     x = np.arange(8.0)
     lower = np.stack([0 * x, x[::-1], 0 * x], axis=1)
     tree = build_tree(lower, lower)
-    assert tree.nodes[1, 6] == 1 and tree.order.tolist() == list(range(7, -1, -1))
+    assert tree.nodes[1, 6] == 1 and tree.boxes.tolist() == list(range(7, -1, -1))
