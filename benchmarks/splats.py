@@ -9,6 +9,7 @@ difference of their depths and the fraction of pixels with equal visibility.
 
 The second table has the time for 320 x 180 pixels with one sample each: medians of ``--runs`` alternating runs, in
 wall-clock seconds and in CPU seconds of all threads, which other programs affect less. Kernels are compiled before.
+Lists of Gaussians by direction are those of the first run, except in the row "from a new position each time".
 `volprim_rf_basic` is Mitsuba's renderer of splats. It computes colour alone, orders Gaussians by shells, and stops at a
 transmittance of a hundredth, like the row "colour, stop 0.01".
 
@@ -31,6 +32,7 @@ SIZE = 320, 180
 DEEPEST = 6.0
 PAIR = "demo"
 PEER = "volprim_rf_basic"
+MOVED = "colour, from a new position each time"
 COLUMNS = {
     "median cm": "median depth error",
     "p90 cm": "90 % quantile",
@@ -111,6 +113,7 @@ def times(scene: Path, files: dict, runs: int) -> list[dict]:
     for name, overrides in {
         "colour, stop 0.01": colour | {"stop": "0.01"},
         "colour": colour,
+        MOVED: colour,
         "colour, by the tree": colour,
         "colour, depth and gaze of an observer": observed,
         "the same, by the tree": observed,
@@ -133,8 +136,12 @@ def times(scene: Path, files: dict, runs: int) -> list[dict]:
     theirs = {"type": "scene", "integrator": {"type": PEER}, "sensor": sensor, "splats": shape}
     loaded[PEER] = mi.load_dict(theirs)
     taken: dict[str, list[tuple[float, float]]] = {name: [] for name in loaded}
+    moved = mi.traverse(loaded[MOVED].sensors()[0])
+    start = mi.Transform4f(moved["to_world"])
     # The second frame of an observer uses cached data of the first, with another kernel.
     for run in range(runs + 2):
+        moved["to_world"] = mi.Transform4f().translate([0.01 * run, 0, 0]) @ start
+        moved.update()
         for name, what in loaded.items():
             wall, cpu = time.perf_counter(), time.process_time()
             np.array(mi.render(what, sensor=0, spp=1, seed=run))
