@@ -105,7 +105,8 @@ def label_fixations(
 
 def describe_slow_sampling(rays: Rays, rules: EventRules) -> str:
     """Return that samples are too far apart for fixations by ``rules``, as part of a sentence; "" if they are not."""
-    interval = estimate_interval(np.diff(rays.t)[np.diff(rays.person) == 0])
+    order, _ = group_by_person(rays)
+    interval = estimate_interval(np.diff(rays.t[order])[np.diff(rays.person[order]) == 0])
     if not interval > rules.max_step * (1 - 1e-6):
         return ""
     return f"samples are {interval:.3g} s apart, and intervals above {rules.max_step:g} s end fixations"
