@@ -1,23 +1,22 @@
 """Gaussian splats fitted to photos through ``mi.render``: PSNR of held-out views before and after, time, memory.
 
-    python benchmarks/splats_fit.py [--resolution 96] [--views 24] [--width 96] [--steps 150] [--rays 8192] [--seeds 3]
-
+    python benchmarks/splats_fit.py [--resolution 96] [--views 24] [--width 96] [--steps 80]
 
 The photos are renderings of the demo store's mesh from a photographer's cameras, chosen as for the store's field. Eight
-other photos, from a shopper's eye, select the learning rates: `RATES` times one of `FACTORS`, for the disturbed splats
-of seed 0. Eight more photos, unused otherwise, give the reported PSNR. Seeds determine the disturbance, the order of
-the rays, and their samples; ± is the standard deviation over seeds.
+other photos, from a shopper's eye, select the learning rates: `RATES` times one of `FACTORS`. Eight more photos, unused
+otherwise, are the held-out ones.
 
 The initial splats are those that `nerg export splats` makes of the field, or those of ``--splats``. They are fitted as
 they are, and disturbed: opacities are multiplied by 0.7, and the other parameters change randomly, with standard
 deviations of 2 cm per axis for centres, a third for scales, about 10 degrees for axes, and a tenth for colours. Adam
 optimises all parameters of the Gaussians: the centre, the logarithms of the scales, the quaternion, the logit of the
-opacity, and the spherical harmonics. The rays are random pixels of all photos. The loss is the squared difference of
-sRGB values. No Gaussian is added or removed.
+opacity, and the spherical harmonics. The loss is the squared difference of sRGB values. No Gaussian is added or
+removed.
 
-The last table has the memory of a derivative against the number of hits per ray: the maximum that Dr.Jit allocates
-during one derivative, beyond what was allocated before. The same 4,096 rays pass through stacks of walls, and each
-number is measured in its own process. The benchmark does not pass or fail.
+The rays of a step are those of one photo, which read lists of Gaussians by direction, or as many random pixels of all
+photos, which search the tree: for as many steps, and for as much CPU time. The time of a step is the median, on one
+thread, since threads that wait for others take CPU time, too. The memory is the maximum that Dr.Jit allocates during a
+fit, beyond what was allocated before. The benchmark does not pass or fail.
 """
 
 from __future__ import annotations
@@ -25,7 +24,6 @@ from __future__ import annotations
 import argparse
 import gc
 import os
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -35,8 +33,9 @@ import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit)
 # BLAS threads spin while they wait, and slow down the others.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from nerg_mi.fields.splats import Splats, harmonics_from_colors, multiply_quaternions
+from nerg_mi.fields.splats import Splats, multiply_quaternions
 from nerg_mi.figures.overlay import srgb
+from nerg_mi.maths.sphere import SH_C0
 from nerg_mi.registration import get_plugin_class
 from timing import save_result
 
@@ -44,17 +43,17 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-PREFIX = "integrator.field."
+FIELD = "integrator.field."
 # Approximate change per step of Adam: metres, logarithms, quaternions, logits, harmonics.
 RATES = {"centers": 1e-3, "log_scales": 0.02, "rotations": 0.01, "logits": 0.05, "harmonics": 0.02}
-FACTORS = (0.5, 1.0, 2.0)
-HITS = (16, 64, 256, 1024)
-SIDE, WARM = 64, 4
+FACTORS = (2.0, 4.0)
+COLUMNS = ("splats", "rays of a step", "rates", "steps", "held-out photos, dB", "training photos, dB")
+COLUMNS += ("validation photos, dB", "CPU time per step, ms", "peak memory, MB")
 
 
-def disturbed(splats: Splats, seed: int = 0) -> Splats:
+def disturb(splats: Splats) -> Splats:
     """``splats``, disturbed as documented above."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     noise = lambda like, size: size * rng.normal(size=like.shape)
     turn = np.concatenate([np.ones((len(splats), 1)), noise(splats.centers, 0.09)], axis=1)
     return Splats(
@@ -62,12 +61,12 @@ def disturbed(splats: Splats, seed: int = 0) -> Splats:
         splats.scales * np.exp(noise(splats.scales, 0.33)),
         multiply_quaternions(turn, splats.rotations),
         0.7 * splats.opacities,
-        splats.harmonics + noise(splats.harmonics, 0.1) / 0.2820948,
+        splats.harmonics + noise(splats.harmonics, 0.1) / SH_C0,
     )
 
 
 class Photos:
-    """Cameras of the store's twin with their images: ``fitted``, ``choosing`` and ``held_out``."""
+    """Cameras of the store's twin with their images: for training, validation, and held out."""
 
     def __init__(self, count: int, width: int):
         from nerg_mi.scenes.store import cameras, layout, views
@@ -75,37 +74,26 @@ class Photos:
         camera = cameras.Pinhole(width, 3 * width // 4)
         plan = layout.build_store(0)
         poses = [*cameras.choose_views(plan, camera, count, 8), cameras.choose_views(plan, camera, 1, 8, seed=1)[1]]
-        photographer = views.StorePhotographer(camera)
+        photographer = views.StorePhotographer(camera, spp=16)
         film = {"type": "hdrfilm", "width": camera.width, "height": camera.height, "rfilter": {"type": "box"}}
         film["component_format"] = "float32"
         sensor = {"type": "perspective", "fov": camera.fov_x, "fov_axis": "x", "near_clip": 0.01, "film": film}
-        self.fitted, self.choosing, self.held_out = (
+        self.training, self.validation, self.held_out = (
             (
                 [mi.load_dict(sensor | {"to_world": mi.ScalarTransform4f(views.to_mitsuba_pose(p))}) for p in group],
-                [srgb(photographer.render_picture(pose, seed, spp)) for seed, pose in enumerate(group)],
+                [srgb(photographer.render_picture(pose, seed)) for seed, pose in enumerate(group)],
             )
-            for group, spp in zip(poses, (16, 64, 64))
+            for group in poses
         )
 
 
-def scene_of(splats: Splats):
-    """The scene of splats, colour alone."""
-    integrator = {
-        "type": "nerg",
-        "field": get_plugin_class("splats").from_network(splats),
-        "occlusion": False,
-        "id": "integrator",
-    }
-    return mi.load_dict({"type": "scene", "integrator": integrator})
-
-
-def psnr(scene, cameras, photos) -> float:
+def psnr(scene, cameras, photos) -> str:
     """Mean PSNR over images, with four samples per pixel."""
     result = []
     for camera, photo in zip(cameras, photos):
         picture = srgb(np.array(mi.render(scene, sensor=camera, spp=4, seed=1))[..., :3])
         result.append(-10 * np.log10(np.square(picture - photo).mean()))
-    return float(np.mean(result))
+    return f"{np.mean(result):.2f}"
 
 
 def as_srgb(x):
@@ -113,92 +101,62 @@ def as_srgb(x):
     return dr.select(x <= 0.0031308, 12.92 * x, 1.055 * dr.power(dr.maximum(x, 0.0031308), 1 / 2.4) - 0.055)
 
 
-def fit(scene, photos: Photos, steps: int, rays: int, factor: float, seed: int) -> None:
-    """Optimise all Gaussians of ``scene`` with ``factor`` times the rates."""
-    params = mi.traverse(scene)
-    params.keep([PREFIX + name for name in ("centers", "scales", "rotations", "opacities", "harmonics")])
-    opacities = dr.clip(params[PREFIX + "opacities"], 1e-4, 1 - 1e-4)
-    start = {name: params[PREFIX + name] for name in ("centers", "rotations", "harmonics")}
-    start |= {"log_scales": dr.log(params[PREFIX + "scales"]), "logits": dr.log(opacities / (1 - opacities))}
-    opt = mi.ad.Adam(lr=1e-3, params=start)
-    cameras, pictures = photos.fitted
+def batches(photos: Photos, is_random: bool):
+    """Sensors of the steps with their targets: photos in random order, or as many random pixels of all."""
+    cameras, pictures = photos.training
     targets = [mi.TensorXf(picture.astype(np.float32)) for picture in pictures]
-    loader = mi.ad.loaders.RayDataLoader(cameras, targets, pixels_per_batch=rays, seed=seed, regular_reshuffle=True)
-    for i in range(steps):
+    size, rng = pictures[0][..., 0].size, np.random.default_rng(0)
+    if is_random:
+        loader = mi.ad.loaders.RayDataLoader(cameras, targets, pixels_per_batch=size, regular_reshuffle=True)
+        while True:
+            target, sensor = loader.next()
+            yield sensor, target
+    while True:
+        yield from ((cameras[k], targets[k]) for k in rng.permutation(len(cameras)))
+
+
+def fit(scene, photos: Photos, steps: int, factor: float, is_random: bool) -> float:
+    """Optimise all Gaussians of ``scene`` with ``factor`` times the rates; CPU seconds of a step."""
+    params = mi.traverse(scene)
+    params.keep([FIELD + name for name in ("centers", "scales", "rotations", "opacities", "harmonics")])
+    opacities = dr.clip(params[FIELD + "opacities"], 1e-4, 1 - 1e-4)
+    start = {name: params[FIELD + name] for name in ("centers", "rotations", "harmonics")}
+    start |= {"log_scales": dr.log(params[FIELD + "scales"]), "logits": dr.log(opacities / (1 - opacities))}
+    opt, seconds = mi.ad.Adam(lr=1e-3, params=start), []
+    for i, (sensor, target) in zip(range(steps), batches(photos, is_random)):
+        begin = time.process_time()
         # Decreasing to a tenth towards the end.
         opt.set_learning_rate({name: factor * rate * 0.1 ** (i / steps) for name, rate in RATES.items()})
         for name in ("centers", "rotations", "harmonics"):
-            params[PREFIX + name] = opt[name]
-        params[PREFIX + "scales"] = dr.exp(opt["log_scales"])
-        params[PREFIX + "opacities"] = 1 / (1 + dr.exp(-opt["logits"]))
+            params[FIELD + name] = opt[name]
+        params[FIELD + "scales"] = dr.exp(opt["log_scales"])
+        params[FIELD + "opacities"] = 1 / (1 + dr.exp(-opt["logits"]))
         params.update()
-        wanted, sensor = loader.next()
-        picture = mi.render(scene, params, sensor=sensor, spp=1, seed=seed * steps + i)
-        dr.backward(dr.mean(dr.square(as_srgb(picture[..., :3]) - wanted), axis=None))
+        picture = mi.render(scene, params, sensor=sensor, spp=1, seed=i)
+        dr.backward(dr.mean(dr.square(as_srgb(picture[..., :3]) - target), axis=None))
         opt.step()
+        dr.sync_thread()
+        seconds.append(time.process_time() - begin)
+    return float(np.median(seconds)) if steps else 0.0
 
 
-def stack(hits: int) -> Splats:
-    """The same number of flat Gaussians for all ``hits``: this many in a row in front of the rays, the others aside."""
-    n = HITS[-1]
-    centers = np.stack([np.where(np.arange(n) < hits, 0, 50), np.zeros(n), np.linspace(-1, 1, n)], axis=1)
-    scales, turned = np.tile([2, 2, 1e-4], (n, 1)), np.tile([1, 0, 0, 0], (n, 1))
-    # Some light is left behind the last, so that all are hit.
-    return Splats(centers, scales, turned, np.full(n, 4 / n), harmonics_from_colors(np.full((n, 3), 0.3)))
-
-
-def peak(hits: int) -> float:
-    """Maximum MB (10^6 bytes) that a derivative allocates, compiled before."""
-    scene = scene_of(stack(hits))
-    params = mi.traverse(scene)
-    keys = [key for key in params.keys() if key.startswith(PREFIX)]
-    sensor = {"type": "orthographic", "to_world": mi.ScalarTransform4f().look_at([0, 0, -3], [0, 0, 0], [0, 1, 0])}
-
-    def derivative(size: int) -> None:
-        film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}}
-        camera = mi.load_dict(sensor | {"film": film})
-        for key in keys:
-            dr.enable_grad(params[key])
-        params.update()
-        dr.backward(dr.sum(mi.render(scene, params, sensor=camera, spp=1), axis=None))
-        dr.eval([dr.grad(params[key]) for key in keys])
-
-    derivative(WARM)
-    return held_at_most(lambda: derivative(SIDE))
-
-
-def held_at_most(work) -> float:
-    """Maximum MB that ``work`` allocates."""
+def measure(name: str, splats: Splats, photos: Photos, steps: int, factor=1.0, is_random=False) -> list[str]:
+    """A row of the table: a fit of ``splats``, or its start with 0 ``steps``."""
+    integrator = {"type": "nerg", "field": get_plugin_class("splats").from_network(splats), "id": "integrator"}
+    scene = mi.load_dict({"type": "scene", "integrator": integrator | {"occlusion": False}})
     gc.collect()
     dr.sync_thread()
     dr.flush_malloc_cache()
     dr.detail.malloc_clear_statistics()
     before = dr.detail.malloc_watermark(dr.JitBackend.LLVM)
-    work()
-    dr.sync_thread()
-    return (dr.detail.malloc_watermark(dr.JitBackend.LLVM) - before) / 1e6
-
-
-def fitted(splats: Splats, photos: Photos, args, factor: float, seed: int) -> dict[str, float]:
-    """Results of one fit, by the column names of the first table."""
-    scene = scene_of(splats)
-    before = {"before": psnr(scene, *photos.held_out), "fitted to, before": psnr(scene, *photos.fitted)}
-    start, cpu = time.perf_counter(), time.process_time()
-    memory = held_at_most(lambda: fit(scene, photos, args.steps, args.rays, factor, seed))
-    seconds, cpu = time.perf_counter() - start, time.process_time() - cpu
-    after = {"after": psnr(scene, *photos.held_out), "fitted to, after": psnr(scene, *photos.fitted)}
-    row = before | after | {"choosing": psnr(scene, *photos.choosing), "s": seconds}
-    row |= {"CPU ms a step": 1e3 * cpu / args.steps, "MB at most": memory}
-    print(factor, seed, row, file=sys.stderr, flush=True)
+    milliseconds = 1e3 * fit(scene, photos, steps, factor, is_random)
+    memory = (dr.detail.malloc_watermark(dr.JitBackend.LLVM) - before) / 1e6
+    row = [name, "random pixels" if is_random else "one photo", f"{factor:g}", f"{steps}"]
+    row = row if steps else [name, "", "", "0"]
+    row += [psnr(scene, *group) for group in (photos.held_out, photos.training, photos.validation)]
+    row += [f"{milliseconds:.0f}", f"{memory:.0f}"] if steps else ["", ""]
+    print(row, file=sys.stderr, flush=True)
     return row
-
-
-def summary(result: list[dict[str, float]]) -> list[str]:
-    """Cells of a row for several fits."""
-    make = lambda key: np.array([row[key] for row in result])
-    keys = ("before", "after", "fitted to, before", "fitted to, after")
-    cells = [f"{make(k).mean():.2f} ± {make(k).std(ddof=1):.2f}" for k in keys]
-    return cells + [f"{make(k).mean():.0f}" for k in ("s", "CPU ms a step", "MB at most")]
 
 
 def main(argv=None) -> None:
@@ -217,21 +175,10 @@ def main(argv=None) -> None:
         default=96,
         help="Width of the photos in pixels; their aspect ratio is 4:3. Default: %(default)s.",
     )
-    parser.add_argument("--steps", type=int, default=150, help="Number of steps of Adam. Default: %(default)s.")
-    parser.add_argument("--rays", type=int, default=8192, help="Number of rays per step. Default: %(default)s.")
-    parser.add_argument(
-        "--seeds", type=int, default=3, help="Number of fits of each kind, at least 2. Default: %(default)s."
-    )
-    parser.add_argument(
-        "--hits",
-        type=int,
-        help="Print only the memory in MB for this number of hits per ray, measured in this process. Default: none.",
-    )
+    parser.add_argument("--steps", type=int, default=80, help="Number of steps of Adam. Default: %(default)s.")
     args = parser.parse_args(argv)
     mi.set_variant("llvm_ad_rgb")
-    if args.hits:
-        print(f"{peak(args.hits):.2f}")
-        return
+    dr.set_thread_count(1)
     from nerg_mi.formats.splats import read_splats
     from splats import make
 
@@ -240,28 +187,16 @@ def main(argv=None) -> None:
         path = Path("out/benchmarks/fit.ply")
         make(path, args.resolution)
     splats, photos = read_splats(path), Photos(args.views, args.width)
-    tried = {factor: fitted(disturbed(splats), photos, args, factor, 0) for factor in FACTORS}
-    factor = max(tried, key=lambda f: tried[f]["choosing"])
-    rows = [[f"{f:g}", f"{row['choosing']:.2f}"] for f, row in tried.items()]
-    save_result("splats-fit-rates", ["factor of the learning rate", "PSNR of validation photos, dB"], rows, "0")
-    kinds = {"as they are": lambda seed: splats, "disturbed": lambda seed: disturbed(splats, seed)}
-    rows = []
-    for name, of_seed in kinds.items():
-        expected = tried[factor] if name == "disturbed" else None
-        result = [
-            expected if seed == 0 and expected else fitted(of_seed(seed), photos, args, factor, seed)
-            for seed in range(args.seeds)
-        ]
-        rows.append([name, *summary(result)])
-    head = ["splats", "held-out photos, before", "after", "training photos, before", "after"]
-    head += ["time, s", "CPU time per step, ms", "peak memory, MB"]
-    save_result("splats-fit", head, rows, f"0 to {args.seeds - 1}")
-    rows = []
-    for hits in HITS:
-        command = [sys.executable, __file__, "--hits", str(hits)]
-        result = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout.strip()
-        rows.append([f"{hits:,}", result])
-    save_result("splats-fit-memory", ["hits per ray", "peak memory, MB"], rows)
+    disturbed = disturb(splats)
+    start = [measure(name, s, photos, 0) for name, s in (("as made", splats), ("disturbed", disturbed))]
+    rows = [measure("disturbed", disturbed, photos, args.steps, factor) for factor in FACTORS]
+    best = max(range(len(FACTORS)), key=lambda k: float(rows[k][6]))
+    factor = FACTORS[best]
+    made = measure("as made", splats, photos, args.steps, factor)
+    equal_steps = measure("disturbed", disturbed, photos, args.steps, factor, True)
+    ratio = float(rows[best][7]) / float(equal_steps[7])
+    equal_time = measure("disturbed", disturbed, photos, round(args.steps * ratio), factor, True)
+    save_result("splats-fit", COLUMNS, [start[0], made, start[1], *rows, equal_steps, equal_time], "0")
 
 
 if __name__ == "__main__":
