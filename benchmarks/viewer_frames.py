@@ -7,7 +7,8 @@ The page gets 60 changes a second. Each image is rendered, coloured and encoded 
 the scene with the compiled copy of its radiance field, which is made next to the field if there is none; with Gaussian
 splats in place of the field, by default about 200,000 that are made of it; and with the field itself. CPU time is that
 of the process for each image. The latency of an image is the time from the change that it shows to its encoded form.
-"Full resolution" is the time from the end of a movement to the first image of the full width.
+"Full resolution" is the time from the end of a movement to the first image of the full width. "PSNR" is that of drafts
+of the usual size, at `NUM_COMPARED` moments of the movement, against images at rest.
 """
 
 from __future__ import annotations
@@ -31,14 +32,16 @@ import numpy as np
 RATE = 60  # Changes a second
 REACH = 0.3  # Amplitude of the movement, scene units
 RESOLUTION = 222  # Lattice of the splats
+NUM_COMPARED = 8
 
 
 @dataclass
 class Image:
-    """An encoded image of a movement: when it was complete, its shape, and seconds of its parts."""
+    """An encoded image of a movement: when it was complete, its shape, pixels per ray, and seconds of its parts."""
 
     time: float
     shape: tuple[int, ...]
+    pixels_per_ray: int
     waiting: float
     rendering: float
     encoding: float
@@ -57,6 +60,7 @@ class Client:
         self.scene, self.images, self.pictures = self, list[Image](), pictures
         # When the displayed change was made, and when its image was begun.
         self.change = self.begin = 0.0
+        self.pixels_per_ray = 1
 
     def atomic(self) -> Any:
         return threading.RLock()
@@ -69,7 +73,8 @@ class Client:
         start = time.monotonic()
         data = cv2_imencode_with_fallback("jpeg", image, jpeg_quality, channel_ordering="rgb")
         end = time.monotonic()
-        self.images.append(Image(end, image.shape[:2], self.begin - self.change, start - self.begin, end - start))
+        parts = self.begin - self.change, start - self.begin, end - start
+        self.images.append(Image(end, image.shape[:2], self.pixels_per_ray, *parts))
         if self.pictures is not None and len(self.images) % 40 == 1:
             self.pictures.mkdir(parents=True, exist_ok=True)
             (self.pictures / f"{len(self.images):05}.jpg").write_bytes(data)
@@ -90,7 +95,7 @@ class Listener:
 def measure(name: str, load: Callable[[], Any], args: argparse.Namespace) -> list[list[str]]:
     """Rows of the table for the environment ``name``: a moving camera, and a moving observer."""
     from nerg_mi.viewer.page import REST_SECONDS, BrowserWindow, Page
-    from nerg_mi.viewer.points import FRAME_WIDTHS, PinholeView
+    from nerg_mi.viewer.points import FRAME_SIZES, PinholeView
     from nerg_mi.viewer.session import Session, SessionSettings
 
     width, seconds, pictures, compile = args.width, args.seconds, args.pictures, name == "compiled"
@@ -107,38 +112,59 @@ def measure(name: str, load: Callable[[], Any], args: argparse.Namespace) -> lis
         changes, make_frame = {id(home): 0.0}, session._make_frame
         last = 0.0
 
-        def record_frame(view: PinholeView, *args: Any, **options: Any) -> Any:
-            client.begin = time.monotonic()
+        def record_frame(view: PinholeView, lattice: Any, *args: Any, **options: Any) -> Any:
+            client.begin, client.pixels_per_ray = time.monotonic(), lattice.pixels_per_ray
             client.change = changes.get(id(view), client.begin) if moving == "camera" else last
-            return make_frame(view, *args, **options)
+            return make_frame(view, lattice, *args, **options)
 
         session._make_frame = record_frame
         if args.frame_width:
-            session.choose_frame_width = lambda view: args.frame_width
+            session.choose_lattice = lambda view: view.make_lattice(args.frame_width)
         rows, eye, views, moving = [], session.observer, [home], "camera"
+
+        def move(t: float) -> PinholeView:
+            """Move the observer, or return the view of a moving camera."""
+            offset = REACH * np.sin(t) * np.cross(home.forward, home.up)
+            if moving == "observer":
+                session.place_observer(eye + offset)
+                return home
+            target = home.origin + home.forward
+            views.append(PinholeView.look_at(home.origin + offset, target, home.up, home.fov, home.aspect))
+            return views[-1]
+
+        def warm_up() -> None:
+            """Compile kernels, and record what the images replay."""
+            sizes = [(args.frame_width, 1)] if args.frame_width else FRAME_SIZES
+            for k in range(4 * len(sizes)):
+                columns, pixels_per_ray = sizes[k // 4]
+                make_frame(move(0.01 * k), home.make_lattice(min(columns, width), pixels_per_ray))
+
+        def compare(columns: int, pixels_per_ray: int) -> float:
+            """Mean PSNR of drafts."""
+            ratios = []
+            for k in range(NUM_COMPARED):
+                view = move(k)
+                draft = make_frame(view, view.make_lattice(columns, pixels_per_ray))[1]
+                error = draft.astype(float) - make_frame(view, view.make_lattice(columns), is_draft=False)[1]
+                ratios.append(20 * np.log10(255 / max(np.sqrt(np.mean(error**2)), 1e-3)))
+            return float(np.mean(ratios))
+
         for moving in ("camera", "observer"):
             page._start_refinement(window)
             session.worker.wait_idle(600)
-            # Kernels are compiled, and what the images replay is recorded.
-            for _ in range(3):
-                session.worker.call(lambda: make_frame(home, args.frame_width or FRAME_WIDTHS[0])).result()
+            session.worker.call(warm_up).result()
             client.images.clear()
             client.pictures = None if pictures is None else pictures / f"{name} {moving}".replace(" ", "-")
             start, used = time.monotonic(), time.process_time()
             while (t := time.monotonic() - start) < seconds:
-                offset = REACH * np.sin(t) * np.cross(home.forward, home.up)
                 last = time.monotonic()
-                if moving == "camera":
-                    with page._lock:
-                        window.view = PinholeView.look_at(
-                            home.origin + offset, home.origin + home.forward, home.up, home.fov, home.aspect
-                        )
-                        views.append(window.view)
+                with page._lock:
+                    window.view = move(t)
+                    if moving == "camera":
                         changes[id(window.view)] = last
                         page._hide_picture(window, last)
-                else:
-                    session.place_observer(eye + offset)
-                    page._on_observer_moved(False)
+                    else:
+                        page._on_observer_moved(False)
                 time.sleep(1 / RATE)
             end, used = time.monotonic(), time.process_time() - used
             images = [image for image in client.images if image.time <= end]
@@ -149,16 +175,19 @@ def measure(name: str, load: Callable[[], Any], args: argparse.Namespace) -> lis
             while not (full := [image.time for image in client.images if image.shape[1] == width]):
                 time.sleep(0.005)
             session.worker.wait_idle(600)
-            sizes = Counter(f"{image.shape[1]} x {image.shape[0]}" for image in images)
-            row = [name, moving, sizes.most_common(1)[0][0] if sizes else "points", f"{len(images) / seconds:.1f}"]
+            row, psnr = [name, moving, "points", f"{len(images) / seconds:.1f}"], ""
             if images:
+                sizes = Counter((image.shape, image.pixels_per_ray) for image in images)
+                ((lines, columns), pixels_per_ray), _ = sizes.most_common(1)[0]
+                row[2] = f"{columns} x {lines}" + (f", {pixels_per_ray} pixels a ray" if pixels_per_ray > 1 else "")
+                psnr = f"{session.worker.call(partial(compare, columns, pixels_per_ray)).result():.1f}"
                 latency, *parts = (
                     [1e3 * getattr(image, part) for image in images]
                     for part in ("latency", "waiting", "rendering", "encoding")
                 )
                 row += [f"{1e3 * used / len(images):.0f}", f"{median(latency):.0f} ({np.quantile(latency, 0.95):.0f})"]
                 row += [f"{median(part):.1f}" for part in parts]
-            rows.append([*row, *[""] * (9 - len(row)), f"{full[0] - end:.2f}"])
+            rows.append([*row, *[""] * (9 - len(row)), f"{full[0] - end:.2f}", psnr])
         return rows
     finally:
         session.stop()
@@ -172,7 +201,10 @@ def main(argv=None) -> None:
     parser.add_argument("--width", type=int, default=640, help="width of the full resolution, pixels (default: 640)")
     parser.add_argument("--seconds", type=float, default=4, help="length of a movement (default: 4)")
     parser.add_argument(
-        "--frame-width", type=int, default=0, help="width of images of a movement (default: that which is fast enough)"
+        "--frame-width",
+        type=int,
+        default=0,
+        help="width of images of a movement, with a ray for each pixel (default: that which is fast enough)",
     )
     parser.add_argument("--splats", type=Path, help="splats of the environment (default: made of the demo store)")
     parser.add_argument("--pictures", type=Path, help="folder for every 40th image (default: none)")
@@ -205,7 +237,7 @@ def main(argv=None) -> None:
         rows += measure(name, load, args)
     parts = ("waiting", "rendering", "encoding")
     columns = ("environment", "moving", "usual size", "images a second", "CPU time, ms", "latency (95 %), ms")
-    save_result("viewer", (*columns, *(f"{part}, ms" for part in parts), "full resolution, s"), rows)
+    save_result("viewer", (*columns, *(f"{part}, ms" for part in parts), "full resolution, s", "PSNR, dB"), rows)
 
 
 if __name__ == "__main__":

@@ -121,6 +121,10 @@ class RenderContext:
         offset = cast("Any", sampler).next_1d(active) if self.nerg.jitter else None
         return CameraView(self, scene, sensors, ray, active, offset, may_list)
 
+    def place(self, scene: mi.Scene, ray: Ray3f, surface: Sequence[Any]) -> CameraView:
+        """Rays without sensors, whose `CameraView.surface` was found before."""
+        return CameraView(self, scene, [], ray, arrays.Bool(True), None, surface=surface)
+
     def list_inputs(
         self, scene: mi.Scene, sensors: Sequence[mi.Sensor], lanes: int, seen: SceneGeometry | None = None
     ) -> list[Any]:
@@ -242,6 +246,8 @@ class CameraView:
         Shift of the march as a fraction of a step.
     may_list : bool
         Whether all rays certainly come from ``sensors``, so that splats can be listed by direction.
+    surface : sequence, optional
+        `surface` of the same rays, which are then not traced: the view has no other values of its own.
     """
 
     def __init__(
@@ -253,6 +259,7 @@ class CameraView:
         active: Bool,
         offset: Float | None,
         may_list: bool = True,
+        surface: Sequence[Any] | None = None,
     ):
         self.context, self.sensors, self.camera_ray, self.active = context, sensors, ray, active
         # The traced ray, and the distance between both origins.
@@ -263,6 +270,11 @@ class CameraView:
         self.geometry = SceneGeometry(medium, scene)
         # Rays of the whole image, of which this may be a strip.
         self.num_rays = count_pixels(sensors, dr.width(ray.o))
+        self.counts_evaluations = "counts" in context.required_data
+        if surface is not None:
+            # The cached properties.
+            vars(self).update(zip(("depth", "has_surface", "penetration"), surface))
+            return
         traced = self.geometry
         if context.seen:
             (traced,) = context.seen
@@ -276,7 +288,6 @@ class CameraView:
         elif medium is not None and features:
             shader = FeatureShader(medium)
         self.shader = shader
-        self.counts_evaluations = "counts" in context.required_data
         self.ray_hit = traced.trace(
             self.ray, active, context.nerg.settings, offset=offset, count=self.counts_evaluations, color=shader
         )
@@ -345,6 +356,12 @@ class CameraView:
     def penetration(self) -> Float | float:
         """Penetration depth of light in front of the surface."""
         return self.ray_hit.penetration(self.context.nerg.observer_settings.depth, self.depth)
+
+    @property
+    def surface(self) -> tuple[Float, Bool, Float]:
+        """Depth, whether there is a surface, and penetration: all that an observer needs of the march, unless
+        evaluations are counted."""
+        return self.depth, self.has_surface, arrays.Float(self.penetration)
 
     def compute_radiance(
         self, scene: mi.Scene, sampler: mi.Sampler, medium: mi.Medium | None

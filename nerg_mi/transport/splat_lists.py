@@ -84,7 +84,7 @@ class SplatLists(SplatHits):
         # The centre with its derivatives.
         self.viewpoint = self.center
         with dr.suspend_grad():
-            bounds = [self._find_cells(window) for window in windows]
+            bounds = self._find_cells(windows)
             order = self._sort_visible(np.any([b.count > 0 for b in bounds], axis=0))
             starts, ranks = [np.zeros(1, np.int64)], []
             for window, rectangle in zip(windows, bounds):
@@ -105,8 +105,8 @@ class SplatLists(SplatHits):
 
     # ---- Lists ----
 
-    def _find_cells(self, window: Window) -> _Rectangles:
-        """The cells of ``window`` that each Gaussian overlaps."""
+    def _find_cells(self, windows: Sequence[Window]) -> list[_Rectangles]:
+        """The cells of each window that each Gaussian overlaps."""
         ns, a = self._ns, self.arrays
         index = dr.arange(ns.UInt32, a.count)
         g = [dr.gather(ns.Float, a.shapes, index * SHAPE_SIZE + i) for i in range(13)]
@@ -115,6 +115,14 @@ class SplatLists(SplatHits):
         m = ns.Array3f(*g[9:12]) - self.center
         # Squared extent in standard deviations, within which enough light is absorbed.
         square = dr.minimum(2 * dr.log(dr.maximum(g[12], 1e-30) / MIN_ALPHA), a.extent**2)
+        bounds = [self._bound(window, m, semi_axes, square) for window in windows]
+        dr.eval(bounds)
+        return [_Rectangles(*(v.numpy() for v in values)) for values in bounds]
+
+    def _bound(self, window: Window, m: Any, semi_axes: list[Any], square: Float) -> list[Any]:
+        """`_Rectangles` of ``window``, as arrays of the backend: of Gaussians with the centres ``m`` seen from the
+        viewpoint, whose ellipsoids have the ``square`` extent."""
+        ns = self._ns
         axes = [ns.Array3f(*map(float, axis)) for axis in window.axes]
         dr.make_opaque(axes)
         x, y, z = (_Extent(dr.dot(axis, m), ns.Array3f(*(dr.dot(axis, s) for s in semi_axes))) for axis in axes)
@@ -128,9 +136,7 @@ class SplatLists(SplatHits):
             limits.append(dr.clip(dr.floor(to_cell(left) - _MARGIN), 0, cells))
             limits.append(dr.clip(dr.floor(to_cell(right) + _MARGIN) + 1, 0, cells))
         # Empty rectangles for those that are not visible.
-        values = [ns.Int32(dr.select(is_visible, v, 0)) for v in limits]
-        dr.eval(values)
-        return _Rectangles(*(v.numpy() for v in values))
+        return [ns.Int32(dr.select(is_visible, v, 0)) for v in limits]
 
     def _sort_visible(self, is_visible: np.ndarray) -> np.ndarray:
         """Indices of the Gaussians that any cell shows, sorted by the distance of their centres."""
@@ -363,15 +369,18 @@ def _list_members(bounds: _Rectangles, order: np.ndarray, cells: tuple[int, int]
     """
     from scipy.sparse import csr_array
 
-    left, bottom = bounds.left[order], bounds.bottom[order]
-    width, count = (bounds.right - bounds.left)[order], bounds.count[order]
+    count = bounds.count[order]
+    # Each face of a cube shows a part of all.
+    (shown,) = np.nonzero(count)
+    order, count = order[shown], count[shown]
+    left, bottom, width = bounds.left[order], bounds.bottom[order], (bounds.right - bounds.left)[order]
     starts = np.concatenate([[0], np.cumsum(count, dtype=np.int64)])
     within = np.arange(starts[-1], dtype=np.int32) - np.repeat(starts[:-1].astype(np.int32), count)
-    row, column = np.divmod(within, np.repeat(np.maximum(width, 1), count))
+    row, column = np.divmod(within, np.repeat(width, count))
     cell = (np.repeat(bottom, count) + row) * cells[0] + np.repeat(left, count) + column
     # A matrix with a row per Gaussian: its columns are the lists, whose entries keep the order of the rows.
     matrix = csr_array((np.ones(len(cell), np.int8), cell, starts), shape=(len(order), cells[0] * cells[1])).tocsc()
-    return matrix.indptr, matrix.indices
+    return matrix.indptr, shown.astype(np.int32)[matrix.indices]
 
 
 @dataclass

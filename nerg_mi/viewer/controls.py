@@ -127,6 +127,7 @@ class Controls:
         # Rounded, since Mitsuba's single precision would show all its digits.
         max_falloff = slider_max(session.falloff)
         falloff = gui.add_slider("Fall-off", 0.0, max_falloff, 0.01 * max_falloff, float(f"{session.falloff:.4g}"))
+        drafts = gui.add_checkbox("Drafts while moving", session.has_drafts)
 
         def change(event: Any) -> None:
             if event.client is None:
@@ -171,6 +172,10 @@ class Controls:
 
         if variant is not None:
             variant.on_update(change_gaze)
+
+        @drafts.on_update
+        def _(event: Any) -> None:
+            session.has_drafts = drafts.value
 
         @falloff.on_update
         def _(event: Any) -> None:

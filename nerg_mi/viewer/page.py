@@ -301,8 +301,8 @@ class Page:
     def _start_frame(self, window: BrowserWindow) -> bool:
         """Start to render a frame of a moving ``window``; return whether frames are fast enough."""
         view, version = window.view, window.version
-        width = None if view is None else self.session.choose_frame_width(view)
-        if view is None or width is None:
+        lattice = None if view is None else self.session.choose_lattice(view)
+        if view is None or lattice is None:
             return False
         if window.is_frame_pending:
             return True
@@ -314,14 +314,16 @@ class Page:
                 # The pictures of a view at rest are better than its frame.
                 if picture is None or colors is None or window.is_handled or not is_open:
                     return
-                window.timings = [f"{width} × {len(colors)}: {picture.seconds:.2f} s a frame"]
+                rays = "" if lattice.pixels_per_ray == 1 else f", a ray for {lattice.pixels_per_ray} pixels"
+                size = f"{lattice.width} × {lattice.height}{rays}"
+                window.timings = [f"{size}: {picture.seconds:.2f} s a frame"]
                 self._show_picture(window, picture, colors, 80)
                 window.frame_version = version
                 if window.version != version:
                     self._start_frame(window)
 
         window.is_frame_pending = True
-        self.session.render_frame(window.client.client_id, view, deliver, width)
+        self.session.render_frame(window.client.client_id, view, deliver, lattice)
         return True
 
     def _show_picture(

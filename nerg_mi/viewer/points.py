@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
@@ -18,6 +18,8 @@ from nerg_mi.environment.scene import Scene
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.progress import SILENT
 from nerg_mi.transport.geometry import Ceiling
+
+from .lattice import Lattice
 
 # ---- Views ----
 
@@ -97,6 +99,10 @@ class PinholeView:
     def picture_height(self, width: int) -> int:
         """Return the height in pixels of a picture of ``width`` pixels."""
         return max(round(width / self.aspect), 1)
+
+    def make_lattice(self, width: int, pixels_per_ray: int = 1) -> Lattice:
+        """Make the `Lattice` of a picture of ``width`` pixels."""
+        return Lattice(width, self.picture_height(width), pixels_per_ray)
 
     def ray_directions(self, width: int, height: int, offsets: np.ndarray) -> np.ndarray:
         """Compute the directions of the rays through the pixels of a picture.
@@ -224,32 +230,55 @@ MAX_FRAME_SECONDS = 0.1
 _FRAME_OVERHEAD = 0.006
 """Time of a frame that does not depend on its size, in seconds: kernels are started, and the image is encoded."""
 
-FRAME_WIDTHS = (640, 480, 320, 240)
-"""The possible widths of the frames of a movement, in pixels."""
+FRAME_SIZES = ((640, 1), (640, 2), (640, 4), (320, 2))
+"""The possible widths in pixels of the frames of a movement, and their pixels per ray."""
+
+_NUM_SLOW_FRAMES = 2
+"""Frames of a new size whose time is not typical: their program is traced and recorded, and kernels are compiled."""
 
 
 class FramePace:
-    """Chooses the width of the frames of a movement from the time of previous rays."""
+    """Chooses the rays of the frames of a movement from the time of previous frames.
+
+    Frames of a view at rest, whose colours and surfaces are kept, are timed separately.
+    """
 
     def __init__(self) -> None:
-        self._ray_seconds: deque[float] = deque(maxlen=5)
+        self._counts: Counter[tuple[bool, int]] = Counter()
+        self._seconds: dict[tuple[bool, int], deque[float]] = {}
+        # The last number of rays of each kind.
+        self._last: dict[bool, int] = {}
 
-    def record(self, seconds: float, num_rays: int) -> None:
-        """Record that ``num_rays`` rays took ``seconds``."""
-        self._ray_seconds.append(max(seconds - _FRAME_OVERHEAD, 0.1 * seconds) / num_rays)
+    def record(self, seconds: float, num_rays: int, is_view_kept: bool = False) -> None:
+        """Record that a frame of ``num_rays`` rays took ``seconds``."""
+        key = is_view_kept, num_rays
+        self._counts[key] += 1
+        if self._counts[key] > _NUM_SLOW_FRAMES:
+            self._seconds.setdefault(key, deque(maxlen=5)).append(seconds)
+            self._last[is_view_kept] = num_rays
 
-    def estimate(self, num_rays: int) -> float:
-        """Return the expected seconds of a frame of ``num_rays`` rays; infinite if the speed of rays is unknown."""
-        if len(self._ray_seconds) < 2:
+    def estimate(self, num_rays: int, is_view_kept: bool = False) -> float:
+        """Return the expected seconds of a frame of ``num_rays`` rays; infinite if nothing was recorded."""
+        is_view_kept = is_view_kept in self._last and is_view_kept
+        if is_view_kept not in self._last:
             return math.inf
         # The median: single times contain the compilation of a kernel.
-        return _FRAME_OVERHEAD + float(np.median(self._ray_seconds)) * num_rays
+        last = self._last[is_view_kept]
+        seconds = float(np.median(self._seconds[is_view_kept, last]))
+        scaled = _FRAME_OVERHEAD + max(seconds - _FRAME_OVERHEAD, 0.1 * seconds) * num_rays / last
+        if (is_view_kept, num_rays) not in self._seconds:
+            return scaled
+        recorded = float(np.median(self._seconds[is_view_kept, num_rays]))
+        # An earlier view may have been slower, and more rays take at most proportionally longer than the last ones.
+        return min(recorded, scaled) if num_rays > last else recorded
 
-    def choose_width(self, view: PinholeView, max_width: int) -> int | None:
-        """Return the width of the next frame of ``view``; None if rays are too slow for frames, or of unknown speed."""
-        seconds = {w: self.estimate(w * view.picture_height(w)) for w in FRAME_WIDTHS if w <= max_width}
-        fast = [w for w in seconds if seconds[w] <= FRAME_SECONDS] or list(seconds)[-1:]
-        return fast[0] if fast and seconds[fast[0]] <= MAX_FRAME_SECONDS else None
+    def choose_lattice(self, view: PinholeView, max_width: int, is_view_kept: bool = False) -> Lattice | None:
+        """Return the pixels of the next frame of ``view``; None if rays are too slow for frames, or of unknown
+        speed."""
+        lattices = [view.make_lattice(min(width, max_width), count) for width, count in FRAME_SIZES]
+        seconds = [self.estimate(lattice.num_rays, is_view_kept) for lattice in lattices]
+        fast = [lattice for lattice, estimate in zip(lattices, seconds) if estimate <= FRAME_SECONDS]
+        return fast[0] if fast else lattices[-1] if seconds[-1] <= MAX_FRAME_SECONDS else None
 
 
 def refine(

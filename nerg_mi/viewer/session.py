@@ -32,11 +32,12 @@ from nerg_mi.transport.geometry import Ceiling
 from . import layers
 from .compilation import BackgroundCompilation, find_compiled_file, is_current
 from .frames import render_frame
+from .lattice import Lattice
 from .layers import DisplaySettings, Layer, Scale
 from .points import (
     BAND_SECONDS,
     BAND_SIZES,
-    FRAME_WIDTHS,
+    FRAME_SIZES,
     BandPace,
     FramePace,
     PinholeView,
@@ -155,7 +156,10 @@ class Session:
         self.regions: list[Region] = []
         self.other_areas: list[Area] = []
         self.band_pace, self.frame_pace = BandPace(), FramePace()
-        # The observer of the last frame.
+        # Whether images of a movement are drafts.
+        self.has_drafts = True
+        # The view and the observer of the last frame.
+        self._last_view: PinholeView | None = None
         self._last_observer: np.ndarray | None = None
         # The volume of the compiled radiance field, and the process that compiles it.
         self.compiled: Any = None
@@ -459,40 +463,49 @@ class Session:
         """
         self.worker.submit(("picture", name), NORMAL_PRIORITY, self._refine_view(view, deliver, width, spp, min_width))
 
-    def choose_frame_width(self, view: PinholeView) -> int | None:
-        """Return the width of frames of ``view`` during a movement; None if rendering is too slow for them."""
-        return self.frame_pace.choose_width(view, self.settings.width)
+    def choose_lattice(self, view: PinholeView) -> Lattice | None:
+        """Return the pixels of the next frame of ``view`` during a movement; None if rendering is too slow for
+        frames."""
+        if not self.has_drafts:
+            return view.make_lattice(min(FRAME_SIZES[0][0], self.settings.width))
+        is_view_kept = view is self._last_view and self.observer is not self._last_observer
+        return self.frame_pace.choose_lattice(view, self.settings.width, is_view_kept)
 
     def render_frame(
         self,
         name: Hashable,
         view: PinholeView,
         deliver: Callable[[StagePicture | None, np.ndarray | None], None],
-        width: int,
+        lattice: Lattice,
     ) -> None:
         """Render a frame of a movement before other tasks, and call ``deliver`` with the picture and its colours, or
-        with None if it could not be rendered. Other arguments as for `refine_picture`."""
+        with None if it could not be rendered. ``lattice``: of `choose_lattice`; others as for `refine_picture`."""
 
         def steps() -> Iterator[None]:
             picture, colors = None, None
             try:
-                picture, colors = self._make_frame(view, width)
+                picture, colors = self._make_frame(view, lattice, self.has_drafts)
             finally:
                 deliver(picture, colors)
             yield
 
         self.worker.submit(("frame", name), FRAME_PRIORITY, steps())
 
-    def _make_frame(self, view: PinholeView, width: int, is_draft: bool = True) -> tuple[StagePicture, np.ndarray]:
+    def _make_frame(
+        self, view: PinholeView, lattice: Lattice, is_draft: bool = True
+    ) -> tuple[StagePicture, np.ndarray]:
         with self.lock:
             display, observer, height = self.display, self.observer, self.ceiling
         options = {
             "ceiling": None if height is None else Ceiling(height, self.ceiling_up),
             "is_draft": is_draft,
             "is_observer_at_rest": observer is self._last_observer,
+            "is_view_at_rest": view is self._last_view,
         }
-        self._last_observer = observer
-        return render_frame(self.scene, view, observer, display.layer, self.scale(), width, self.frame_pace, **options)
+        self._last_view, self._last_observer = view, observer
+        return render_frame(
+            self.scene, view, observer, display.layer, self.scale(), lattice, self.frame_pace, **options
+        )
 
     def _colorize(self, layer: Layer, picture: StagePicture) -> np.ndarray:
         values = layer.select_values(picture.values)
@@ -632,7 +645,7 @@ class Session:
     ) -> Iterator[None]:
         """Refine the picture of a browser, beginning with one of the full width if that is fast."""
         if self.has_scale and self.frame_pace.estimate(width * view.picture_height(width)) <= BAND_SECONDS:
-            deliver(*self._make_frame(view, width, is_draft=False))
+            deliver(*self._make_frame(view, view.make_lattice(width), is_draft=False))
             min_width = width
             yield None
         yield from self._refine(view, deliver, width, spp, min_width=min_width)
@@ -640,9 +653,10 @@ class Session:
 
     def _time_frames(self, view: PinholeView) -> Iterator[None]:
         """Compile the kernels of frames, and measure the time of their rays, unless they are known to be fast."""
-        if self.settings.width >= FRAME_WIDTHS[-1] and self.choose_frame_width(view) is None:
+        if self.choose_lattice(view) is None:
+            width, pixels_per_ray = FRAME_SIZES[-1]
             for _ in range(3):
-                self._make_frame(view, FRAME_WIDTHS[-1])
+                self._make_frame(view, view.make_lattice(min(width, self.settings.width), pixels_per_ray))
                 yield None
 
     def _refine(

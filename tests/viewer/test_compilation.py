@@ -7,6 +7,7 @@ import threading
 import time
 
 import drjit.llvm.ad as ns
+import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
@@ -16,6 +17,7 @@ from nerg_mi.formats.fields import save_radiance
 from nerg_mi.maths.geometry import Box
 from nerg_mi.viewer import compilation
 from nerg_mi.viewer.compilation import BackgroundCompilation, find_compiled_file, is_current
+from nerg_mi.viewer.layers import get_layer
 from nerg_mi.viewer.page import BrowserWindow, Page
 from nerg_mi.viewer.points import FRAME_SECONDS, FramePace, PinholeView
 
@@ -89,18 +91,44 @@ def test_a_failure_is_reported_and_a_stop_is_silent(rgb, tmp_path):
 # ---- Frames ----
 
 
-def test_width_of_frames():
+def repeat(pace, seconds, num_rays, is_view_kept=False):
+    """Record frames until a time counts, and replaces those before."""
+    for _ in range(7):
+        pace.record(seconds, num_rays, is_view_kept)
+
+
+def test_rays_of_frames():
     pace = FramePace()
-    assert pace.choose_width(VIEW, 720) is None  # Unknown
-    for seconds_per_ray, width in ((1e-9, 640), (FRAME_SECONDS / (400 * 250), 320), (6e-6, None)):
-        for _ in range(5):
-            pace.record(1e5 * seconds_per_ray, 100_000)
-        assert pace.choose_width(VIEW, 720) == width
-        assert width is None or pace.choose_width(VIEW, 300) == 240
+    assert pace.choose_lattice(VIEW, 720) is None  # Unknown
+    for seconds_per_ray, size in ((1e-9, (640, 1)), (FRAME_SECONDS / (400 * 250), (640, 4)), (1e-5, None)):
+        repeat(pace, 1e5 * seconds_per_ray, 100_000)
+        assert pace.choose_lattice(VIEW, 720) == (None if size is None else VIEW.make_lattice(*size))
+        assert size is None or pace.choose_lattice(VIEW, 300).width == 300
     pace = FramePace()
-    for seconds in (10.0, 1e-6, 1e-6):  # The first one contains the compilation of a kernel.
+    for seconds in (10.0, 10.0, 1e-6):  # Programs are recorded by the second frame.
         pace.record(seconds, 1000)
-    assert pace.choose_width(VIEW, 720) == 640
+    assert pace.choose_lattice(VIEW, 720) == VIEW.make_lattice(640)
+
+
+def test_frames_have_all_pixels_again_once_these_are_fast():
+    pace, sizes = FramePace(), [VIEW.make_lattice(640, n).num_rays for n in (1, 2, 4)]
+    choose = lambda: 640 * VIEW.picture_height(640) / pace.choose_lattice(VIEW, 640).num_rays
+    # Half of the time does not depend on rays.
+    repeat(pace, 1.2 * FRAME_SECONDS, sizes[0])
+    assert choose() == 2
+    repeat(pace, 0.9 * FRAME_SECONDS, sizes[1])
+    repeat(pace, 0.7 * FRAME_SECONDS, sizes[2])
+    assert choose() == 2
+    repeat(pace, 0.45 * FRAME_SECONDS, sizes[1])
+    assert choose() == 1
+
+
+def test_kept_views_have_their_own_pace():
+    pace, num_rays = FramePace(), VIEW.make_lattice(640).num_rays
+    repeat(pace, 0.5 * FRAME_SECONDS, num_rays)
+    assert pace.choose_lattice(VIEW, 640, True).pixels_per_ray == 1
+    repeat(pace, 1.5 * FRAME_SECONDS, num_rays, True)
+    assert [pace.choose_lattice(VIEW, 640, is_kept).pixels_per_ray for is_kept in (False, True)] == [1, 2]
 
 
 class _Scene:
@@ -130,8 +158,8 @@ def test_a_moving_view_shows_frames_if_they_are_fast(room, gaze_fields, make_ses
     page.windows[client.client_id] = window
 
     def set_speed(seconds_per_ray):
-        for _ in range(5):
-            session.frame_pace.record(seconds_per_ray, 1)
+        session.frame_pace = FramePace()
+        repeat(session.frame_pace, seconds_per_ray, 1)
 
     set_speed(1.0)
     page._hide_picture(window, time.monotonic())
@@ -149,9 +177,25 @@ def test_a_moving_view_shows_frames_if_they_are_fast(room, gaze_fields, make_ses
     page._hide_picture(window, time.monotonic())
     window.is_handled = True
     assert session.worker.wait_idle(120) and len(client.scene.pictures) == 2
+    # Without drafts, frames are complete, however long they take.
+    set_speed(1.0)
+    session.has_drafts = False
+    assert session.choose_lattice(window.view) == window.view.make_lattice(320)
+    session.has_drafts = True
     # An error ends the frame only.
     set_speed(1e-9)
     session.frame_pace.record = None
     window.is_handled = False
     page._hide_picture(window, time.monotonic())
     assert session.worker.wait_idle(120) and not window.is_frame_pending and len(session.listener.errors) == 1
+
+
+def test_drafts_of_a_moving_observer_equal_pictures_at_rest(room, gaze_fields, make_session):
+    session = make_session(room, gaze_fields[0], width=64)
+    assert session.worker.wait_idle(120)
+    session.set_display(layer=get_layer("observer_depth"))
+    view, lattice = session.home_view, session.home_view.make_lattice(64)
+    make = lambda is_draft: session.worker.call(lambda: session._make_frame(view, lattice, is_draft)[1]).result()
+    for k in range(4):
+        session.place_observer(np.array([0.1 * k, 0.2, 0.5]))
+        assert np.mean(make(True) != make(False)) < 0.01

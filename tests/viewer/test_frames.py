@@ -30,6 +30,12 @@ def trace_colors(scene, view, observer, layer, scale):
     return layers.colorize(layer, picture["color"], values, mask, scale), scale
 
 
+def draw(scene, view, eye, layer, scale, pixels_per_ray=1, **options):
+    """The colours of a frame."""
+    lattice = view.make_lattice(WIDTH, pixels_per_ray)
+    return render_frame(scene, view, eye, layer, scale, lattice, FramePace(), **options)[1]
+
+
 def is_close(one, other) -> bool:
     """Whether all but a few bytes of two pictures, at edges, differ by at most two."""
     return np.mean(np.abs(one.astype(int) - other.astype(int)) > 2) < 0.01
@@ -49,8 +55,34 @@ def test_layers_of_further_frames_equal_traces(scene, name):
         eye = np.array([0.1 * k, 0.2, 0.5])
         view = replace(home, origin=home.origin + np.array([0, 0.1 * k, 0]))
         expected, scale = trace_colors(scene, view, eye, layer, scale)
-        picture, colors = render_frame(scene, view, eye, layer, scale, WIDTH, FramePace(), is_draft=False)
-        assert picture.values == {} and is_close(colors, expected), k
+        assert is_close(draw(scene, view, eye, layer, scale, is_draft=False), expected), k
+
+
+@pytest.mark.parametrize("name", ["gaze", "visibility", "observer_depth", "density_evals"])
+def test_frames_of_a_moving_observer_equal_traces(scene, name):
+    """Colours and surfaces of the view are computed for the first one only."""
+    layer, view, scale = layers.get_layer(name), PinholeView.from_sensor(scene.resolve_sensor(0)), None
+    for ceiling in (None, Ceiling(0.6)):
+        for k in range(4):
+            eye = np.array([0.1 * k, 0.2, 0.5])
+            with override_attribute(scene, "ceiling", ceiling):
+                expected, scale = trace_colors(scene, view, eye, layer, scale)
+            colors = draw(scene, view, eye, layer, scale, is_view_at_rest=True, ceiling=ceiling)
+            assert is_close(colors, expected), k
+
+
+@pytest.mark.parametrize("is_view_at_rest", [False, True])
+@pytest.mark.parametrize("pixels_per_ray", [2, 4])
+def test_pixels_without_rays_lie_between_their_neighbours(scene, pixels_per_ray, is_view_at_rest):
+    # Its display does not depend on the light, which is random.
+    layer, view = layers.get_layer("observer_depth"), PinholeView.from_sensor(scene.resolve_sensor(0))
+    eye = np.array([0.1, 0.2, 0.5])
+    expected, scale = trace_colors(scene, view, eye, layer, None)
+    colors = draw(scene, view, eye, layer, scale, pixels_per_ray, is_view_at_rest=is_view_at_rest)
+    y, x = np.indices(expected.shape[:2])
+    is_traced = (x + y) % 2 == 0 if pixels_per_ray == 2 else (x % 2 == 0) & (y % 2 == 0)
+    assert is_close(colors[is_traced], expected[is_traced])
+    assert np.abs(colors.astype(float) - expected).mean() < 3
 
 
 def test_classes_use_their_colours(room_scene):
@@ -60,7 +92,7 @@ def test_classes_use_their_colours(room_scene):
     layer = layers.Layer(replace(depth.overlay, quantity=shown))
     view = PinholeView.from_sensor(room_scene.resolve_sensor(0))
     expected, scale = trace_colors(room_scene, view, view.origin, layer, None)
-    assert is_close(render_frame(room_scene, view, view.origin, layer, scale, WIDTH, FramePace())[1], expected)
+    assert is_close(draw(room_scene, view, view.origin, layer, scale), expected)
 
 
 def test_a_ceiling_and_drafts(scene):
@@ -72,7 +104,7 @@ def test_a_ceiling_and_drafts(scene):
         with override_attribute(scene, "ceiling", ceiling):
             expected, scale = trace_colors(scene, view, eye, layer, None)
         options = {"ceiling": ceiling, "is_draft": is_draft, "is_observer_at_rest": True}
-        pictures.append(render_frame(scene, view, eye, layer, scale, WIDTH, FramePace(), **options)[1])
+        pictures.append(draw(scene, view, eye, layer, scale, **options))
         assert is_close(pictures[-1], expected) is not is_draft
     plain, draft, cut = (picture.astype(float) for picture in pictures)
     assert np.abs(plain - draft).mean() < 3 and np.abs(plain - cut).mean() > 2
@@ -96,7 +128,7 @@ def test_splats_are_listed_for_each_view(splats):
         view = PinholeView.look_at((3, 0.2 * k, 0.3), (0, 0, 0), (0, 0, 1), 0.7, 1.5)
         expected, _ = trace_colors(splats, view, view.origin, layer, scale)
         for is_draft, tolerance in ((False, 2), (True, 5)):
-            colors = render_frame(splats, view, view.origin, layer, scale, WIDTH, FramePace(), is_draft=is_draft)[1]
+            colors = draw(splats, view, view.origin, layer, scale, is_draft=is_draft)
             assert expected.std() > 20 and np.abs(colors.astype(float) - expected).mean() < tolerance, k
     assert isinstance(next(iter(splats.integrator.medium.lists.values()))[1], SplatLists)
 
@@ -104,7 +136,7 @@ def test_splats_are_listed_for_each_view(splats):
 def test_only_drafts_are_timed(room_scene):
     view, pace = PinholeView.from_sensor(room_scene.resolve_sensor(0)), FramePace()
     layer, scale = layers.get_layer("color"), layers.Scale()
-    for is_draft in (False, False, True, True):
+    for is_draft in (False, False, True, True, True):
         assert pace.estimate(100) == np.inf
-        render_frame(room_scene, view, view.origin, layer, scale, WIDTH, pace, is_draft=is_draft)
+        render_frame(room_scene, view, view.origin, layer, scale, view.make_lattice(WIDTH), pace, is_draft=is_draft)
     assert 0 < pace.estimate(100) < pace.estimate(1000) < np.inf
