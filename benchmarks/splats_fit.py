@@ -46,7 +46,7 @@ import numpy as np
 FIELD = "integrator.field."
 # Approximate change per step of Adam: metres, logarithms, quaternions, logits, harmonics.
 RATES = {"centers": 1e-3, "log_scales": 0.02, "rotations": 0.01, "logits": 0.05, "harmonics": 0.02}
-FACTORS = (2.0, 4.0)
+FACTORS = (1.0, 2.0, 4.0)
 COLUMNS = ("splats", "rays of a step", "rates", "steps", "held-out photos, dB", "training photos, dB")
 COLUMNS += ("validation photos, dB", "CPU time per step, ms", "peak memory, MB")
 
@@ -74,16 +74,16 @@ class Photos:
         camera = cameras.Pinhole(width, 3 * width // 4)
         plan = layout.build_store(0)
         poses = [*cameras.choose_views(plan, camera, count, 8), cameras.choose_views(plan, camera, 1, 8, seed=1)[1]]
-        photographer = views.StorePhotographer(camera, spp=16)
+        photographer = views.StorePhotographer(camera)
         film = {"type": "hdrfilm", "width": camera.width, "height": camera.height, "rfilter": {"type": "box"}}
         film["component_format"] = "float32"
         sensor = {"type": "perspective", "fov": camera.fov_x, "fov_axis": "x", "near_clip": 0.01, "film": film}
         self.training, self.validation, self.held_out = (
             (
                 [mi.load_dict(sensor | {"to_world": mi.ScalarTransform4f(views.to_mitsuba_pose(p))}) for p in group],
-                [srgb(photographer.render_picture(pose, seed)) for seed, pose in enumerate(group)],
+                [srgb(photographer.render_picture(pose, seed, spp)) for seed, pose in enumerate(group)],
             )
-            for group in poses
+            for group, spp in zip(poses, (16, 64, 64))
         )
 
 
