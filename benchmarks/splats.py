@@ -1,6 +1,6 @@
 """The demo store as Gaussian splats, compared with its field and its shapes, and their speed with Mitsuba's renderer.
 
-    python benchmarks/splats.py [--resolution 208] [--width 180] [--runs 5] [--picture FILE.png]
+    python benchmarks/splats.py [--resolution 208] [--width 180] [--runs 5] [--only TABLE] [--picture FILE.png]
     [--out out/benchmarks/splats]
 
 The splats are made of the trained field as by `nerg export splats`, or read from ``--splats``. The first table compares
@@ -12,6 +12,10 @@ wall-clock seconds and in CPU seconds of all threads, which other programs affec
 Lists of Gaussians by direction are those of the first run, except in the row "from a new position each time".
 `volprim_rf_basic` is Mitsuba's renderer of splats. It computes colour alone, orders Gaussians by shells, and stops at a
 transmittance of a hundredth, like the row "colour, stop 0.01".
+
+The third table has the CPU time per pixel of 1280 x 720 pixels with one sample each, for kinds of cameras, by lists and
+by the tree: the minimum of ``--runs`` runs, without and with making the lists. Apertures are radii, as fractions of the
+distance in focus. The similarity of both images is that of their displayed colours.
 
 The image of ``--picture`` has the rows field, splats, shapes and the columns colour, depth, gaze, visibility.
 """
@@ -29,6 +33,7 @@ from timing import save_result
 import numpy as np
 
 SIZE = 320, 180
+CAMERA_SIZE = 1280, 720
 DEEPEST = 6.0
 PAIR = "demo"
 PEER = "volprim_rf_basic"
@@ -76,6 +81,23 @@ def compare(scenes: dict[str, tuple[Path, dict]], width: int) -> list[dict]:
         for pair in PAIRS
         for name, (scene, files) in scenes.items()
     ]
+
+
+def save_exact(scenes: dict[str, tuple[Path, dict]], width: int) -> None:
+    """The first table, and the line below it."""
+    exact, rows = compare(scenes, width), []
+    for name in scenes:
+        mine = [row for row in exact if row["place"] == name]
+        m = {key: float(np.mean([row[key] for row in mine])) for key in COLUMNS}
+        is_length = lambda key: key.endswith(" cm") and key != "within 5 cm"
+        rows.append([name, *(f"{m[key]:.2g} cm" if is_length(key) else f"{m[key]:.1%}" for key in COLUMNS)])
+    save_result("splats-exact", ("environment", *COLUMNS.values()), rows)
+    separate = same_depth(scenes, width)
+    medians, same = ([row[key] for row in separate] for key in ("median cm", "same"))
+    print(
+        f"splats against the field: depths are {min(medians):.2f} to {max(medians):.2f} cm apart (medians by pair), "
+        f"visibility is the same for {np.mean(same):.1%} ({min(same):.1%} to {max(same):.1%} by pair)\n"
+    )
 
 
 def same_depth(scenes: dict[str, tuple[Path, dict]], width: int) -> list[dict]:
@@ -155,6 +177,56 @@ def times(scene: Path, files: dict, runs: int) -> list[dict]:
     ]
 
 
+def cameras(splats: Path, runs: int) -> list[list[str]]:
+    """Rows of the third table."""
+    from nerg_mi.figures.overlay import srgb
+    from nerg_mi.maths.color import psnr
+
+    import mitsuba as mi
+
+    (width, height), (origin, target, _) = CAMERA_SIZE, ([float(v) for v in text.split(",")] for text in PAIRS[PAIR])
+    to_world = mi.ScalarTransform4f().look_at(origin, target, [0, 0, 1])
+    focus = float(np.linalg.norm(np.subtract(target, origin)))
+    kinds = {
+        "perspective": {"type": "perspective", "fov": 78},
+        "orthographic": {"type": "orthographic", "to_world": to_world @ mi.ScalarTransform4f().scale([2.5, 2.5, 1])},
+        **{
+            f"thin lens, {part:.1%}": {
+                "type": "thinlens",
+                "fov": 78,
+                "aperture_radius": part * focus,
+                "focus_distance": focus,
+            }
+            for part in (0.005, 0.02, 0.1)
+        },
+    }
+    film = {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}}
+    rows = []
+    for kind, sensor in kinds.items():
+        images, seconds = [], []
+        for has_lists in (True, False):
+            field = {"type": "splats", "filename": str(splats), "lists": has_lists}
+            integrator = {"type": "nerg", "field": field, "aovs": "opacity"}
+            scene = mi.load_dict(
+                {"type": "scene", "integrator": integrator, "sensor": {"to_world": to_world, "film": film, **sensor}}
+            )
+            for is_new in (False, True) if has_lists else (False,):
+                taken = []
+                # Kernels are compiled in the first run.
+                for _ in range(runs + 1):
+                    if is_new:
+                        scene.integrator().medium.lists.clear()
+                    start = time.process_time()
+                    image = np.array(mi.render(scene, spp=1, seed=1))
+                    taken.append(1e6 * (time.process_time() - start) / (width * height))
+                seconds.append(min(taken[1:]))
+            images.append(srgb(image[..., :3]))
+        cached, made, tree = seconds
+        row = [kind, f"{cached:.2f} µs", f"{made:.2f} µs", f"{tree:.2f} µs", f"{cached / tree:.2f}"]
+        rows.append([*row, f"{psnr(*images):.1f} dB"])
+    return rows
+
+
 def picture(path: Path, scenes: dict[str, tuple[Path, dict]]) -> None:
     """Field, splats and shapes, one below the other."""
     from nerg_mi.figures.overlay import srgb, write_png
@@ -185,6 +257,7 @@ def main(argv=None) -> None:
         help="Width of the images of the first table in pixels; their aspect ratio is 3:2. Default: %(default)s.",
     )
     parser.add_argument("--runs", type=int, default=5, help="Number of timed runs. Default: %(default)s.")
+    parser.add_argument("--only", choices=("exact", "time", "cameras"), help="Table to compute. Default: all.")
     parser.add_argument("--picture", type=Path, help="PNG file to write. Default: none.")
     parser.add_argument(
         "--out", type=Path, default=Path("out/benchmarks/splats"), help="Folder for files. Default: %(default)s."
@@ -208,30 +281,15 @@ def main(argv=None) -> None:
     if args.picture:
         picture(args.picture, scenes | {"shapes": (store.parent / "shapes.xml", gaze)})
         print(f"wrote {args.picture}", flush=True)
-    exact = compare(scenes, args.width)
-    rows = []
-    for name in scenes:
-        mine = [row for row in exact if row["place"] == name]
-        m = {key: float(np.mean([row[key] for row in mine])) for key in COLUMNS}
-        rows.append(
-            [
-                name,
-                *(
-                    f"{m[key]:.2g} cm" if key.endswith(" cm") and key != "within 5 cm" else f"{m[key]:.1%}"
-                    for key in COLUMNS
-                ),
-            ]
-        )
-    save_result("splats-exact", ("environment", *COLUMNS.values()), rows)
-    separate = same_depth(scenes, args.width)
-    medians, same = ([row[key] for row in separate] for key in ("median cm", "same"))
-    print(
-        f"splats against the field: depths are {min(medians):.2f} to {max(medians):.2f} cm apart (medians by pair), "
-        f"visibility is the same for {np.mean(same):.1%} ({min(same):.1%} to {max(same):.1%} by pair)\n"
-    )
-    speed = times(scenes["splats"][0], files, args.runs)
-    rows = [[r["what"], f"{r['s']:.2f}", f"{r['CPU s']:.2f} s", f"{r['of volprim']:.2g}"] for r in speed]
-    save_result("splats-time", ("outputs", "time, s", "CPU time", f"relative to `{PEER}`"), rows)
+    if args.only in (None, "exact"):
+        save_exact(scenes, args.width)
+    if args.only in (None, "time"):
+        speed = times(scenes["splats"][0], files, args.runs)
+        rows = [[r["what"], f"{r['s']:.2f}", f"{r['CPU s']:.2f} s", f"{r['of volprim']:.2g}"] for r in speed]
+        save_result("splats-time", ("outputs", "time, s", "CPU time", f"relative to `{PEER}`"), rows)
+    if args.only in (None, "cameras"):
+        columns = "camera", "CPU time per pixel", "and making lists", "by the tree", "lists / tree", "PSNR"
+        save_result("splats-cameras", columns, cameras(args.splats, args.runs))
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ from nerg_mi.transport.observer import (
     CacheEntry,
     ObserverCache,
     ObserverView,
-    camera_windows,
+    camera_cells,
     center_of_ray,
     check_centers,
     distance_and_direction,
@@ -224,14 +224,12 @@ def count_pixels(sensors: Sequence[mi.Sensor], lanes: int) -> int:
 
 
 def see_from_camera(geometry: SceneGeometry, sensors: Sequence[mi.Sensor], num_rays: int) -> SceneGeometry:
-    """``geometry`` for ``num_rays`` rays of a single camera with a centre; for others unchanged."""
-    # Windows are computed for splats only.
+    """``geometry`` for ``num_rays`` rays of a single camera whose rays have cells; for others unchanged."""
+    # Cells are computed for splats only.
     if len(sensors) != 1 or not isinstance(geometry.medium, SplatMedium):
         return geometry
-    windows = camera_windows(sensors[0])
-    if windows is None:
-        return geometry
-    return geometry.seen_from(sensor_center(sensors[0]), num_rays, windows)
+    cells = camera_cells(sensors[0])
+    return geometry if cells is None else geometry.seen_from(sensor_center(sensors[0]), num_rays, cells)
 
 
 class CameraView:
@@ -245,7 +243,7 @@ class CameraView:
     offset : Float or None
         Shift of the march as a fraction of a step.
     may_list : bool
-        Whether all rays certainly come from ``sensors``, so that splats can be listed by direction.
+        Whether all rays certainly come from ``sensors``, so that splats can be listed.
     surface : sequence, optional
         `surface` of the same rays, which are then not traced: the view has no other values of its own.
     """

@@ -28,8 +28,7 @@ Gaussian splats (:monosp:`splats`)
 
  * - lists
    - |bool|
-   - Whether rays from one point, of a camera or an observer, may read lists of Gaussians by direction (see below).
-     (Default: true)
+   - Whether rays of a camera or an observer may read lists of Gaussians (see below). (Default: true)
 
  * - centers, scales, rotations, opacities, harmonics
    - |tensor|
@@ -49,11 +48,14 @@ Depth refers to the peaks: ``expected`` is their mean, ``median`` (and ``refined
 own opacity is reached. Of the march parameters only ``stop`` applies (default here: 1e-4), and ``step``, which sets the
 tolerance of occlusion (default: the median thickness of the Gaussians).
 
-With 4,096 Gaussians or more, rays of perspective cameras, panoramas and observers read lists of the Gaussians in their
-direction, as rasterisers do, instead of searching a tree, in a third to a tenth of the time. Three things differ.
-Gaussians are sorted by the distances of their centres, and by their peaks only among each nine successive ones. Colours
-are those in the directions of the centres, as in 3DGS. Gaussians that absorb less than 1/255 of the light are left out.
-Other rays, such as batches of random pixels of several cameras, and functions that ``dr.freeze`` records use the tree.
+With 4,096 Gaussians or more, rays of perspective, thin-lens and orthographic cameras, panoramas and observers read
+lists of the Gaussians in their part of the image, as rasterisers do, instead of searching a tree, in a third to a
+tenth of the time. Three things differ. Gaussians are sorted by the distances of their centres from the camera
+(orthographic: along its axis), and by their peaks only among each nine successive ones. Colours are those in the
+directions of the centres, from the middle of a lens, as in 3DGS. Gaussians that absorb less than 1/255 of the light
+are left out. Other rays, such as batches of random pixels of several cameras, and functions that ``dr.freeze`` records
+use the tree, and so do lenses that blur so many Gaussians so far that their lists would have more than 33 million
+entries.
 
 Derivatives reach the Gaussians, cameras and observers as for a radiance field, from the lists or the tree that the rays
 read, with memory that does not grow with the number of hits. They ignore changes of the set of Gaussians along a ray

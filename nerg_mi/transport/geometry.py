@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from types import ModuleType
@@ -24,7 +23,8 @@ from .march import march_with_prepass
 from .march_primal import MarchResult, MarchSettings, default_color_cutoff, default_dt_gamma, default_step, default_stop
 from .medium import Medium
 from .mitsuba_mesh import count_faces, read_vertices
-from .splat_lists import Window, list_splats
+from .ray_cells import CubeCells, RayCells
+from .splat_lists import list_splats
 from .splat_medium import SplatMedium
 
 if TYPE_CHECKING:
@@ -222,19 +222,19 @@ class SceneGeometry:
         """Diagonal of the bounding box of the geometry and ``points`` (3,), in scene units."""
         return float(np.linalg.norm(np.ptp([*(self.bounds() or ()), *(np.asarray(p, float) for p in points)], axis=0)))
 
-    def seen_from(self, center: Point3f, rays: int, windows: Sequence[Window] = ()) -> SceneGeometry:
-        """This geometry for ``rays`` rays whose lines pass through ``center`` (one lane, in front of their origins).
+    def seen_from(self, center: Point3f, rays: int, cells: RayCells | None = None) -> SceneGeometry:
+        """This geometry for ``rays`` rays around ``center`` (one lane).
 
-        Gaussian splats are listed by direction (`splat_lists.list_splats`), unless there are too few rays; other media
-        are traced alike from everywhere. ``windows``: the directions of the rays in the scene; default: all.
+        Gaussian splats are listed by cells (`splat_lists.list_splats`), unless there are too few rays; other media are
+        traced alike from everywhere. ``cells``: the rays in the scene; default: those through ``center``, which is in
+        front of their origins, in all directions.
         """
         # Lists are made outside of kernels.
         is_symbolic = is_recording() or dr.flag(dr.JitFlag.SymbolicScope)
         if not isinstance(self.medium, SplatMedium) or is_symbolic or dr.width(center) != 1:
             return self
         to_world = self.medium.to_world
-        turn = to_world.matrix[:3, :3] / to_world.scale
-        local = tuple(w._replace(axes=w.axes @ turn) for w in windows)
+        local = (cells or CubeCells()).to_local(to_world)
         seen = copy(self)
         seen.medium = list_splats(self.medium, to_world.point_to_local(center), rays, local)
         return seen

@@ -282,8 +282,8 @@ class HitMarchOp(MarchOp):
 # ---- Derivatives of a march along lists of Gaussians ----
 #
 # As above, with the hits, the order and the end of `SplatLists.march`. Derivatives reach the rows of the lists, one per
-# Gaussian, and from there, outside of the loop, the shapes and colours of the Gaussians. Rays pass through the
-# viewpoint of the lists, so a change of a ray is a change of its direction and a shift of that point.
+# Gaussian, and from there, outside of the loop, the shapes and colours of the Gaussians. A change of a ray is a change
+# of its direction and a shift of the point from which distances are measured (`SplatLists.locate`).
 
 
 class ListMarchOp(MarchOp):
@@ -300,7 +300,7 @@ class ListMarchOp(MarchOp):
 
     def _march_again(self, visit: Callable[..., tuple[Any, Any]], extra: Any) -> Any:
         f, ray, Float = self.request, LocalRay(*self.inputs), type(self.inputs[3])
-        self.offset, self.limits = self.lists.distance_to(ray), light_limits(Float, f)
+        (self.offset, self.origin), self.limits = self.lists.locate(ray), light_limits(Float, f)
         color = None if f.color is None else f.color.zero()
         start = ListSums(active=f.active, light=Float(1), moment=Float(0), color=color)
         t0, t1 = (t + self.offset for t in self.inputs[3:])
@@ -314,6 +314,7 @@ class ListMarchOp(MarchOp):
         lists, active, shader = self.lists, state.active, self.request.color
         (o, d, _, t0, _), (primal_o, primal_d, _, primal_t0, _) = leaves, self.inputs
         shift = (o - primal_o) - self.offset * (d - primal_d)
+        shift = shift if self.origin is None else self.origin + shift
         row = lists.gather_rows(place.rank, active)
         t, alpha, _ = lists.evaluate(row, d, shift)
         goal, stop = self.limits

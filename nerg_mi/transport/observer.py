@@ -17,8 +17,9 @@ from nerg_mi.maths.types import Float, Point3f, Ray3f, Vector3f, variant_types
 from .geometry import SURFACE_OPACITY, SceneGeometry
 from .jit import Fingerprint, fingerprint_shapes, is_recording
 from .march_primal import MarchSettings
+from .ray_cells import CubeCells, LensCells, ParallelCells, RayCells
 from .recording import Recorder
-from .splat_lists import CAMERA_CELLS, Window
+from .splat_lists import CAMERA_CELLS
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -264,36 +265,37 @@ def sensor_centers(sensors: Sequence[mi.Sensor]) -> list[Point3f]:
     return [sensor_center(m) for s in sensors for m in _members(s)]
 
 
-def camera_windows(sensor: mi.Sensor) -> tuple[Window, ...] | None:
-    """The directions of the rays of ``sensor``, in cells of a few pixels; None unless its rays pass through one point.
-    A panorama has all directions: the empty tuple."""
+def camera_cells(sensor: mi.Sensor) -> RayCells | None:
+    """The rays of ``sensor`` around its `sensor_center`, in cells of a few pixels; None for other kinds of sensors."""
     import mitsuba as mi
 
-    if (kind := _kind(sensor)) not in ("PerspectiveCamera", "Panorama"):
-        return None
+    kind, film, camera = _kind(sensor), sensor.film(), cast("Any", sensor)
     if kind == "Panorama":
-        return ()
-    film = sensor.film()
-    corners: Any = cast("Any", sensor).sample_ray(0, 0.5, mi.Point2f([0, 1, 0], [0, 0, 1]), mi.Point2f(0.5))[0].d
-    axes = [cast("Any", sensor).world_transform() @ mi.Vector3f(*axis) for axis in np.eye(3).tolist()]
-    axes = np.array([np.array(dr.detach(axis)).ravel() for axis in axes], np.float64)
-    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
-    x, y, z = axes @ np.array(dr.detach(corners), np.float64)
-    pixels = int(np.clip(round(np.sqrt(int(dr.prod(film.crop_size())) / CAMERA_CELLS)), 4, 16))
-    lower, upper, cells = [], [], []
-    for axis, (first, last), size in (
-        (0, (x / z)[[0, 1]], film.crop_size()[0]),
-        (1, (y / z)[[0, 2]], film.crop_size()[1]),
-    ):
-        if last < first:
-            axes[axis], first, last = -axes[axis], -first, -last
-        # One more cell on both sides: a film can sample its border.
-        count = -(-int(size) // pixels)
-        edge = (last - first) / size * pixels
-        lower.append(float(first - edge))
-        upper.append(float(first + (count + 1) * edge))
-        cells.append(count + 2)
-    return (Window(axes, tuple(lower), tuple(upper), tuple(cells)),)
+        return CubeCells()
+    if kind not in ("PerspectiveCamera", "ThinLensCamera", "OrthographicCamera"):
+        return None
+    read = lambda v: np.array(dr.detach(v), np.float64).reshape(3, -1)
+    corners = camera.sample_ray(0, 0.5, mi.Point2f([0, 1, 0, 1], [0, 0, 1, 1]), mi.Point2f(0.5))[0]
+    forward, right = (camera.world_transform() @ mi.Vector3f(*axis) for axis in ((0, 0, 1), (1, 0, 0)))
+    # An orthographic camera may be sheared.
+    axes, _ = np.linalg.qr(np.hstack([read(forward), read(right)]), mode="complete")
+    axes = axes[:, [1, 2, 0]].T * np.sign(read(forward).ravel() @ axes[:, 0])
+    o, d = axes @ (read(corners.o) - read(sensor_center(sensor))), axes @ read(corners.d)
+    positions = o[:2] if kind == "OrthographicCamera" else d[:2] / d[2]
+    size = film.crop_size()
+    pixels = int(np.clip(round(np.sqrt(int(dr.prod(size)) / CAMERA_CELLS)), 4, 16))
+    # One more cell on both sides: a film can sample its border.
+    count = np.array([-(-int(n) // pixels) for n in size])
+    first, last = positions.min(axis=1), positions.max(axis=1)
+    edge = (last - first) / np.array(size) * pixels
+    lower, upper, cells = (tuple(v.tolist()) for v in (first - edge, first + (count + 1) * edge, count + 2))
+    if kind == "PerspectiveCamera":
+        return RayCells(axes, lower, upper, cells)
+    if kind == "OrthographicCamera":
+        return ParallelCells(axes, lower, upper, cells, forward=forward)
+    parameters = mi.traverse(sensor)
+    radius, focus = (np.array(dr.detach(parameters[name])).item() for name in ("aperture_radius", "focus_distance"))
+    return LensCells(axes, lower, upper, cells, radius=radius, focus=focus) if radius > 0 and focus > 0 else None
 
 
 def center_of_ray(sensors: Sequence[mi.Sensor], ray: Ray3f) -> Point3f:

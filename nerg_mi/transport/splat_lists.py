@@ -1,11 +1,11 @@
-"""Lists of the Gaussians that rays from one point can meet, by direction: splats as a rasteriser draws them.
+"""Lists of the Gaussians that rays of a camera or an observer can meet, by cells: splats as a rasteriser draws them.
 
-Rays of a camera, or of an observer, start at one point. The directions around it are divided into cells; each cell has
-the list of the Gaussians that its rays can meet, sorted by the distance of their centres (tiles of Kerbl et al. 2023,
-"3D Gaussian Splatting"). A ray reads the list of its cell, where the tree of `splat_medium` would search. Gaussians are
-evaluated exactly along the ray. What differs from the tree: their order on a ray is that of their centres, their colour
-is that in the direction of their centre, and those that absorb less than `MIN_ALPHA` are left out. Derivatives are
-those of the same sums: a ray reads its list again (`march.ListMarchOp`).
+The rays are divided into cells (`ray_cells`); each cell has the list of the Gaussians that its rays can meet, sorted by
+the distance of their centres (tiles of Kerbl et al. 2023, "3D Gaussian Splatting"). A ray reads the list of its cell,
+where the tree of `splat_medium` would search. Gaussians are evaluated exactly along the ray. What differs from the
+tree: their order on a ray is that of their centres, their colour is that in the direction of their centre, and those
+that absorb less than `MIN_ALPHA` are left out. Derivatives are those of the same sums: a ray reads its list again
+(`march.ListMarchOp`).
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from nerg_mi.maths.types import Bool, Float, Point3f, UInt32, Vector3f
 from .jit import Fingerprint
 from .march_primal import MarchRequest, MarchResult, optical_depth_limits
 from .medium import ColorShader, LocalRay
+from .ray_cells import Ellipsoids, RayCells
 from .splat_medium import SHAPE_SIZE, SplatArrays, SplatHits, SplatMedium, find_peak
 
 if TYPE_CHECKING:
@@ -42,53 +43,31 @@ its colour."""
 NUM_WAITING = 8
 """Hits of a ray that wait for nearer ones: the order of centres is corrected as far as that."""
 
+_FACES_PER_KERNEL = 6
 _MARGIN = 0.02  # Cells by which the bounds of a Gaussian are extended for the rounding of directions
 
 
-class Window(NamedTuple):
-    """Directions that a plane shows: u = x / z and v = y / z between ``lower`` and ``upper``, with z > 0."""
-
-    axes: np.ndarray  # Unit vectors x, y and z in the frame of the Gaussians (3, 3)
-    lower: tuple[float, float]
-    upper: tuple[float, float]
-    cells: tuple[int, int]  # Cells along u and v
-
-
-def cube_windows(cells: int) -> tuple[Window, ...]:
-    """The faces of a cube, with ``cells`` along each edge: windows 2 a and 2 a + 1 look along axis a and against it."""
-    unit = np.eye(3)
-    return tuple(
-        Window(np.stack([unit[(a + 1) % 3], unit[(a + 2) % 3], sign * unit[a]]), (-1, -1), (1, 1), (cells, cells))
-        for a in range(3)
-        for sign in (1, -1)
-    )
-
-
 class SplatLists(SplatHits):
-    """The lists of the cells of ``windows`` (one, or the six of `cube_windows`) around ``center``.
-
-    ``center`` (3,) in the frame of the Gaussians ``arrays``.
-    """
+    """The lists of ``cells`` around ``center`` (3,), in the frame of the Gaussians ``arrays``; ``rectangles``: of
+    `find_rectangles`."""
 
     # Read with derivatives only, or never by traced programs.
-    UNRECORDED = ("size", "viewpoint")
+    UNRECORDED = ("size", "view")
 
-    def __init__(self, arrays: SplatArrays, center: np.ndarray, windows: tuple[Window, ...]):
+    def __init__(self, arrays: SplatArrays, center: np.ndarray, cells: RayCells, rectangles: list[Rectangles]):
         super().__init__(arrays)
-        self._num_windows, self._cells = len(windows), windows[0].cells
         ns = arrays.namespace
-        self._ns = ns
+        self._ns, self.cells = ns, cells.prepare(ns)
         self.center = ns.Array3f(*(float(c) for c in center))
         # Literals would compile kernels for each viewpoint.
         dr.make_opaque(self.center)
-        # The centre with its derivatives.
-        self.viewpoint = self.center
+        # The centre or the direction of the rays, with its derivatives.
+        self.view = self.cells.view(self.center)
         with dr.suspend_grad():
-            bounds = self._find_cells(windows)
-            order = self._sort_visible(np.any([b.count > 0 for b in bounds], axis=0))
+            order = self._sort_visible(np.any([r.count > 0 for r in rectangles], axis=0))
             starts, ranks = [np.zeros(1, np.int64)], []
-            for window, rectangle in zip(windows, bounds):
-                begin, members = _list_members(rectangle, order, window.cells)
+            for rectangle in rectangles:
+                begin, members = _list_members(rectangle, order, cells.cells)
                 starts.append(begin[1:].astype(np.int64) + starts[-1][-1])
                 ranks.append(members)
             # Numbers of all lists.
@@ -97,56 +76,18 @@ class SplatLists(SplatHits):
             self._entries = ns.UInt32(copy_aligned(np.concatenate([*ranks, np.zeros(1, np.int32)]), np.uint32))
             self._indices = ns.UInt32(copy_aligned(order, np.uint32)) if len(order) else dr.zeros(ns.UInt32, 1)
             self.rows = self._make_rows()
-        first = windows[0]
-        self._axes = [ns.Array3f(*map(float, axis)) for axis in first.axes]
-        self._lower = [ns.Float(float(v)) for v in first.lower]
-        self._rate = [ns.Float(n / (b - a)) for n, a, b in zip(first.cells, first.lower, first.upper)]
-        dr.make_opaque(self._axes, self._lower, self._rate)
 
     # ---- Lists ----
 
-    def _find_cells(self, windows: Sequence[Window]) -> list[_Rectangles]:
-        """The cells of each window that each Gaussian overlaps."""
-        ns, a = self._ns, self.arrays
-        index = dr.arange(ns.UInt32, a.count)
-        g = [dr.gather(ns.Float, a.shapes, index * SHAPE_SIZE + i) for i in range(13)]
-        rows = [ns.Array3f(*g[i : i + 3]) for i in (0, 3, 6)]
-        semi_axes = [row / dr.squared_norm(row) for row in rows]
-        m = ns.Array3f(*g[9:12]) - self.center
-        # Squared extent in standard deviations, within which enough light is absorbed.
-        square = dr.minimum(2 * dr.log(dr.maximum(g[12], 1e-30) / MIN_ALPHA), a.extent**2)
-        bounds = [self._bound(window, m, semi_axes, square) for window in windows]
-        dr.eval(bounds)
-        return [_Rectangles(*(v.numpy() for v in values)) for values in bounds]
-
-    def _bound(self, window: Window, m: Any, semi_axes: list[Any], square: Float) -> list[Any]:
-        """`_Rectangles` of ``window``, as arrays of the backend: of Gaussians with the centres ``m`` seen from the
-        viewpoint, whose ellipsoids have the ``square`` extent."""
-        ns = self._ns
-        axes = [ns.Array3f(*map(float, axis)) for axis in window.axes]
-        dr.make_opaque(axes)
-        x, y, z = (_Extent(dr.dot(axis, m), ns.Array3f(*(dr.dot(axis, s) for s in semi_axes))) for axis in axes)
-        is_visible, limits = square > 0, []
-        for k, across in enumerate((x, y)):
-            low, high = dr.opaque(ns.Float, window.lower[k]), dr.opaque(ns.Float, window.upper[k])
-            left, right, is_seen = _project(across, z, square, low, high)
-            is_visible &= is_seen
-            cells = window.cells[k]
-            to_cell = lambda v, low=low, high=high, n=cells: dr.clip((v - low) / (high - low) * n, -1, n + 1)
-            limits.append(dr.clip(dr.floor(to_cell(left) - _MARGIN), 0, cells))
-            limits.append(dr.clip(dr.floor(to_cell(right) + _MARGIN) + 1, 0, cells))
-        # Empty rectangles for those that are not visible.
-        return [ns.Int32(dr.select(is_visible, v, 0)) for v in limits]
-
     def _sort_visible(self, is_visible: np.ndarray) -> np.ndarray:
-        """Indices of the Gaussians that any cell shows, sorted by the distance of their centres."""
+        """Indices of the Gaussians that any cell shows, sorted by their centres."""
         ns, (index,) = self._ns, np.nonzero(is_visible)
         if len(index) == 0:
             return index
         i = ns.UInt32(copy_aligned(index, np.uint32)) * SHAPE_SIZE
         m = ns.Array3f(*(dr.gather(ns.Float, self.arrays.shapes, i + 9 + k) for k in range(3))) - self.center
         # A stable order in a quarter of the time of `np.argsort`: floats from 0 on are sorted as their bits.
-        keys = dr.squared_norm(m).numpy().view(np.uint32).astype(np.uint64) << np.uint64(32)
+        keys = self.cells.order(m).numpy().view(np.uint32).astype(np.uint64) << np.uint64(32)
         return index[np.sort(keys | np.arange(len(index), dtype=np.uint64)) & np.uint64(0xFFFFFFFF)]
 
     def _make_rows(self) -> Float:
@@ -155,46 +96,32 @@ class SplatLists(SplatHits):
         g = [dr.gather(ns.Float, a.shapes, index * SHAPE_SIZE + i) for i in range(13)]
         m = ns.Array3f(*g[9:12]) - self.center
         from_center = [-(g[i] * m.x + g[i + 1] * m.y + g[i + 2] * m.z) for i in (0, 3, 6)]
-        seen = ns.Array3f(*g[9:12]) - self.viewpoint
+        seen = self.cells.direction_to(ns.Array3f(*g[9:12]), self.view)
         color = a.color(index, seen * dr.rsqrt(dr.maximum(dr.squared_norm(seen), 1e-30)), ns.Bool(True))
         rows: Any = dr.ravel(ns.ArrayXf([*g[:9], *from_center, g[12], *color]))
         dr.eval(rows)
         return rows
 
     def attach(self) -> SplatLists:
-        """These lists with rows that carry the derivatives of the Gaussians, and of the viewpoint through colours."""
+        """These lists with rows that carry the derivatives of the Gaussians, and of the view through colours."""
         lists = copy(self)
         lists.rows = self._make_rows()
         return lists
 
     # ---- Rays ----
 
-    def _find_list(self, d: Vector3f) -> tuple[UInt32, UInt32]:
-        """First and last entry (exclusive) of the cell with the direction ``d``."""
-        ns, (nu, nv) = self._ns, self._cells
-        if self._num_windows == 1:
-            x, y, z = (dr.dot(axis, d) for axis in self._axes)
-            face = ns.UInt32(0)
-        else:
-            size = [dr.abs(d.x), dr.abs(d.y), dr.abs(d.z)]
-            is_x = (size[0] >= size[1]) & (size[0] >= size[2])
-            is_y = ~is_x & (size[1] >= size[2])
-            pick = lambda a, b, c: dr.select(is_x, a, dr.select(is_y, b, c))
-            x, y, along = pick(d.y, d.z, d.x), pick(d.z, d.x, d.y), pick(d.x, d.y, d.z)
-            z = dr.abs(along)
-            face = pick(ns.UInt32(0), ns.UInt32(2), ns.UInt32(4)) + dr.select(along < 0, ns.UInt32(1), ns.UInt32(0))
-        cell = []
-        for value, low, rate, count in zip((x, y), self._lower, self._rate, (nu, nv)):
-            cell.append(ns.UInt32(dr.clip((value / z - low) * rate, 0, count - 1)))
-        number = (face * nv + cell[1]) * nu + cell[0]
-        return dr.gather(ns.UInt32, self._starts, number), dr.gather(ns.UInt32, self._starts, number + 1)
+    def locate(self, ray: LocalRay) -> tuple[Float, Vector3f | None]:
+        """The point from which distances along ``ray`` are measured.
 
-    def distance_to(self, ray: LocalRay) -> Float:
-        """Distance along ``ray`` from the viewpoint, through which its line passes, to its origin."""
-        return dr.norm(ray.o - self.center) * dr.rsqrt(dr.squared_norm(ray.d))
+        Returns the distance from there to the origin of the ray, and the displacement from the centre to that point;
+        None: they are the same point.
+        """
+        if self.cells.has_center:
+            return dr.norm(ray.o - self.center) * dr.rsqrt(dr.squared_norm(ray.d)), None
+        return dr.zeros(self._ns.Float), self._ns.Array3f(ray.o) - self.center
 
     def evaluate(self, row: Sequence[Float], d: Vector3f, shift: Vector3f | None = None) -> tuple[Float, Float, Float]:
-        """`SplatArrays.find_peak` of the Gaussian with the numbers ``row`` on the ray from the viewpoint, moved by
+        """`SplatArrays.find_peak` of the Gaussian with the numbers ``row`` on the ray from the centre, moved by
         ``shift``, in the direction ``d``."""
         turn = lambda v: [dr.fma(row[i], v.x, dr.fma(row[i + 1], v.y, row[i + 2] * v.z)) for i in (0, 3, 6)]
         from_center = row[9:12]
@@ -214,15 +141,16 @@ class SplatLists(SplatHits):
     def loop_hits(
         self, ray: LocalRay, t0: Float, t1: Float, start: Any, visit: Callable[..., Any], extra: Any = None
     ) -> tuple[Any, Any, Float]:
-        """Loop over the hits of ``ray``, whose line passes through the viewpoint in front of its origin, of the march
-        and of its derivatives.
+        """Loop over the hits of ``ray``, one of those that ``cells`` divide, of the march and of its derivatives.
 
         ``visit(state, hit, extra)`` processes a hit of the lanes on which ``state.active`` is true. It returns the
-        state, on whose ``active`` lanes the march goes on, and ``extra``. Distances are measured from the viewpoint.
+        state, on whose ``active`` lanes the march goes on, and ``extra``. Distances are measured as by `locate`.
         Returns both at the end, and the number of Gaussians that were evaluated.
         """
         ns, Float = self._ns, type(t0)
-        first, last = self._find_list(ray.d)
+        shift = self.locate(ray)[1]
+        cell = self.cells.find_cell(ray.o - self.center, ray.d)
+        first, last = dr.gather(ns.UInt32, self._starts, cell), dr.gather(ns.UInt32, self._starts, cell + 1)
 
         def process(walk: _ListWalk, hit: ListHit, waiting: list[ListHit], active: Bool) -> _ListWalk:
             here = active & (hit.alpha > 0)
@@ -233,7 +161,7 @@ class SplatLists(SplatHits):
             """Read an entry of the list, and process the nearest hit that is known by then."""
             rank = dr.gather(ns.UInt32, self._entries, walk.entry, walk.active)
             row = self.gather(rank, range(13), walk.active)
-            t, alpha, distance = self.evaluate(row, ray.d)
+            t, alpha, distance = self.evaluate(row, ray.d, shift)
             hit = walk.active & (t >= t0) & (t < t1) & (alpha >= MIN_ALPHA) & (distance < self.arrays.extent**2)
             # What is no hit comes first, and absorbs nothing.
             new = ListHit(dr.select(hit, t, -dr.inf), dr.select(hit, alpha, 0), rank)
@@ -252,12 +180,11 @@ class SplatLists(SplatHits):
         return walk.state, walk.extra, Float(walk.entry - first)
 
     def march(self, ray: LocalRay, t0: Float, t1: Float, request: MarchRequest) -> MarchResult:
-        """March ``ray``, whose line passes through the viewpoint in front of its origin, as `march_hits` does, without
-        derivatives."""
+        """March ``ray``, one of those that ``cells`` divide, as `march_hits` does, without derivatives."""
         ns, Float = self._ns, type(t0)
         medium, shader, occlusion = request.medium, request.color, request.occlusion
         goal, stop = light_limits(Float, request)
-        offset = self.distance_to(ray)
+        offset, _ = self.locate(ray)
         t0, t1 = t0 + offset, t1 + offset
 
         def visit(state: _Blend, hit: ListHit, _: None) -> tuple[_Blend, None]:
@@ -313,38 +240,8 @@ def light_limits(Float: type, request: MarchRequest) -> tuple[Float, Float]:
     return dr.exp(-goal), dr.exp(-end)
 
 
-class _Extent(NamedTuple):
-    """Gaussians along one axis: their centres, and their semi-axes of one standard deviation."""
-
-    center: Float
-    semi_axes: Any
-
-
-def _project(across: _Extent, along: _Extent, square: Float, low: Float, high: Float) -> tuple[Float, Float, Bool]:
-    """Bounds of ellipsoids on a plane at distance 1, and whether they overlap the interval from ``low`` to ``high``.
-
-    A plane through the viewpoint, x = u z, touches the ellipsoid of squared extent k^2 where (m_x - u m_z)^2 = k^2
-    |L_x - u L_z|^2, with the centre m and the semi-axes L. The discriminant is written without differences of large
-    numbers.
-    """
-    (mx, Lx), (mz, Lz) = across, along
-    in_front = mz * mz - square * dr.squared_norm(Lz)
-    root = square * (dr.squared_norm(mz * Lx - mx * Lz) - square * dr.squared_norm(dr.cross(Lx, Lz)))
-    mean, spread = mx * mz - square * dr.dot(Lx, Lz), dr.sqrt(dr.maximum(root, 0))
-    inverse = dr.rcp(dr.select(in_front != 0, in_front, 1e-30))
-    tangents = (mean - spread) * inverse, (mean + spread) * inverse
-    first, last = dr.minimum(*tangents), dr.maximum(*tangents)
-    # An ellipsoid that reaches behind the viewpoint is seen outside of both tangents, if there are any.
-    is_around = (in_front <= 0) & (root > 0)
-    is_between = lambda v: is_around & (v > first) & (v < last)
-    left = dr.select(in_front > 0, first, dr.select(is_between(low), last, low))
-    right = dr.select(in_front > 0, last, dr.select(is_between(high), first, high))
-    is_behind = (in_front > 0) & (mz < 0)
-    return left, right, ~is_behind & (left <= high) & (right >= low) & (left <= right)
-
-
-class _Rectangles(NamedTuple):
-    """Cells of a window that each of N Gaussians overlaps: begin and end (exclusive) along both axes, (N,) each."""
+class Rectangles(NamedTuple):
+    """Cells of a face that each of N Gaussians overlaps: begin and end (exclusive) along both axes, (N,) each."""
 
     left: np.ndarray
     right: np.ndarray
@@ -357,7 +254,35 @@ class _Rectangles(NamedTuple):
         return (self.right - self.left) * (self.top - self.bottom)
 
 
-def _list_members(bounds: _Rectangles, order: np.ndarray, cells: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+def find_rectangles(arrays: SplatArrays, center: np.ndarray, cells: RayCells) -> list[Rectangles]:
+    """The cells of each face of ``cells`` around ``center`` that each Gaussian overlaps."""
+    ns, cells = arrays.namespace, cells.prepare(arrays.namespace)
+    with dr.suspend_grad():
+        origin = dr.opaque(ns.Array3f, center.tolist())
+        index = dr.arange(ns.UInt32, arrays.count)
+        g = [dr.gather(ns.Float, arrays.shapes, index * SHAPE_SIZE + i) for i in range(13)]
+        rows = [ns.Array3f(*g[i : i + 3]) for i in (0, 3, 6)]
+        # Squared extent in standard deviations, within which enough light is absorbed.
+        square = dr.minimum(2 * dr.log(dr.maximum(g[12], 1e-30) / MIN_ALPHA), arrays.extent**2)
+        semi_axes = [row / dr.squared_norm(row) for row in rows]
+        ellipsoids = Ellipsoids(ns.Array3f(*g[9:12]) - origin, semi_axes, square)
+        bounds = []
+        for face in range(cells.num_faces):
+            is_visible, limits = square > 0, []
+            for (low, high), count in zip(cells.bound(ellipsoids, face), cells.cells):
+                is_visible &= (low <= high) & (low <= count) & (high >= 0)
+                limits.append(dr.clip(dr.floor(low - _MARGIN), 0, count))
+                limits.append(dr.clip(dr.floor(high + _MARGIN) + 1, 0, count))
+            # Empty rectangles for those that are not visible.
+            bounds.append([ns.Int32(dr.select(is_visible, v, 0)) for v in limits])
+            # One kernel for the faces of a cube; those of the tiles of a lens would make it long.
+            if face % _FACES_PER_KERNEL == _FACES_PER_KERNEL - 1:
+                dr.eval(bounds)
+        dr.eval(bounds)
+    return [Rectangles(*(v.numpy() for v in values)) for values in bounds]
+
+
+def _list_members(bounds: Rectangles, order: np.ndarray, cells: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     """Sort Gaussians into cells.
 
     Returns
@@ -464,43 +389,43 @@ MIN_GAUSSIANS = 1 << 12
 MIN_RAYS_PER_GAUSSIAN = 1 / 16
 """Number of rays per Gaussian from which the lists, which are made for them, take less time than the tree."""
 
+_MAX_ENTRIES = 1 << 25  # Entries of the lists of rays without a centre, which can be long for blurred Gaussians
 _MAX_NUMBERS = 1 << 26  # Numbers in the lists of earlier viewpoints that a medium keeps, 4 bytes each
 
 
-def cells_of_observer(count: int) -> int:
-    """Cells along the edge of a face of the cube around an observer among ``count`` Gaussians."""
-    return int(np.clip(round(np.sqrt(count) / 8), 16, 128))
-
-
-def list_splats(medium: SplatMedium, center: Point3f, rays: int, windows: tuple[Window, ...] = ()) -> SplatMedium:
-    """The ``medium`` for ``rays`` rays from ``center``, with lists where they take less time than the tree.
+def list_splats(medium: SplatMedium, center: Point3f, rays: int, cells: RayCells) -> SplatMedium:
+    """The ``medium`` for ``rays`` rays around ``center``, with lists where they take less time than the tree.
 
     Parameters
     ----------
     center : Point3f
-        Viewpoint in the frame of the Gaussians, one lane. The line of each ray passes through it, in front of the ray's
-        origin.
-    windows : tuple of Window
-        Directions of the rays, in that frame; default: all.
+        Centre of the rays in the frame of the Gaussians, one lane.
+    cells : RayCells
+        The rays, in that frame. Where all pass through the centre, it is in front of their origins.
     """
     arrays = medium.arrays
     if not medium.may_list or arrays.count < MIN_GAUSSIANS or rays < MIN_RAYS_PER_GAUSSIAN * arrays.count:
         return medium
-    windows = windows or cube_windows(cells_of_observer(arrays.count))
     position = np.array(dr.detach(center), np.float64).ravel()
-    key = (tuple(map(float, position)), tuple((w.axes.tobytes(), w.lower, w.upper, w.cells) for w in windows))
+    cells = cells.adapt(arrays.count, position)
+    key = (tuple(map(float, position)), cells.key)
     made_of = Fingerprint(dr.detach([arrays.shapes, arrays.colors]))
     # Lists of other Gaussians, as before a step of an optimisation, are of no use any more.
     for other in [k for k, (earlier, _) in medium.lists.items() if earlier != made_of]:
         del medium.lists[other]
-    _, lists = medium.lists.pop(key, (None, None))
-    if lists is None:
-        lists = SplatLists(arrays, position, windows)
+    if key in medium.lists:
+        _, lists = medium.lists.pop(key)
+    else:
+        rectangles = find_rectangles(arrays, position, cells)
+        is_small = cells.has_center or sum(int(r.count.sum(dtype=np.int64)) for r in rectangles) <= _MAX_ENTRIES
+        lists = SplatLists(arrays, position, cells, rectangles) if is_small else None
         # The lists of a camera and of an observer are kept in any case.
-        while len(medium.lists) > 1 and sum(other.size for _, other in medium.lists.values()) > _MAX_NUMBERS:
+        while len(medium.lists) > 1 and sum(other.size for _, other in medium.lists.values() if other) > _MAX_NUMBERS:
             del medium.lists[next(iter(medium.lists))]
     medium.lists[key] = made_of, lists
+    if lists is None:
+        return medium
     seen = copy(medium)
     seen.hits = copy(lists)
-    seen.hits.viewpoint = arrays.namespace.Array3f(center)
+    seen.hits.view = arrays.namespace.Array3f(cells.view(center))
     return seen

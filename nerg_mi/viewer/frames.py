@@ -21,7 +21,7 @@ from nerg_mi.maths.arrays import copy_aligned
 from nerg_mi.maths.color import linear_to_srgb
 from nerg_mi.maths.types import variant_types
 from nerg_mi.transport.geometry import Ceiling
-from nerg_mi.transport.splat_lists import Window
+from nerg_mi.transport.ray_cells import RayCells
 from nerg_mi.transport.splat_medium import SplatMedium
 
 from .lattice import Lattice
@@ -128,7 +128,7 @@ class _Frame:
         half_height = half_width * lattice.height / lattice.width
         cells = _SPLAT_CELLS, max(round(_SPLAT_CELLS * lattice.height / lattice.width), 1)
         corner = half_width, half_height
-        self._plane = Window(np.stack([right, -view.up, view.forward]), (-half_width, -half_height), corner, cells)
+        self._plane = RayCells(np.stack([right, -view.up, view.forward]), (-half_width, -half_height), corner, cells)
         self._origin = mi.Point3f(*map(float, view.origin))
         axes = (view.forward, half_width * right, -half_height * view.up)
         self._axes = [mi.Vector3f(*map(float, v)) for v in axes]
@@ -165,7 +165,7 @@ class _Frame:
     def _list_inputs(self, is_traced: bool) -> list[Any]:
         num_rays, seen = self.lattice.num_rays, None
         if is_traced:
-            seen = self.scene.geometry.seen_from(self._origin, num_rays, (self._plane,))
+            seen = self.scene.geometry.seen_from(self._origin, num_rays, self._plane)
         return self.context.list_inputs(self.scene.mitsuba, [], num_rays, seen)
 
     def _keep_view(self) -> list[Any]:

@@ -238,29 +238,50 @@ def test_all_hits_before_the_end_of_a_ray_have_derivatives(rgb, no_tree):
 # ---- Images ----
 
 KEY = "i.field."
+CAMERAS = {
+    "perspective": lambda mi: still(camera(mi, (0.2, 0.1, -3), size=24)),
+    "orthographic": lambda mi: still(camera(mi, (0.2, 0.1, -3), kind="orthographic", size=24)),
+    # Its rays are random.
+    "lens": lambda mi: camera(
+        mi, (0.2, 0.1, -3), kind="thinlens", size=24, fov=35, aperture_radius=0.2, focus_distance=2.7
+    ),
+}
 
 
-def scene_of(rgb, splats, extent=3.0):
+def scene_of(rgb, splats, extent=3.0, kind="perspective"):
     place = get_plugin_class("splats").from_network(splats)
     place.field.extent = extent
     place.field.pack()
     integrator = {"type": "nerg", "id": "i", "field": place, "depth": "expected", "stop": 1e-7}
-    sensor = still(camera(rgb, (0.2, 0.1, -3), size=24)) | {"id": "s"}
+    sensor = CAMERAS[kind](rgb) | {"id": "s"}
     return rgb.load_dict({"type": "scene", "i": integrator, "s": sensor})
+
+
+def channels_of(rgb, scene, params):
+    """Channels of an image; of a lens, those of random rays, since Mitsuba takes others for derivatives."""
+    sensor, integrator = scene.sensors()[0], scene.integrator()
+    if not sensor.needs_aperture_sample():
+        picture = rgb.render(scene, params, spp=1, seed=0)
+        return [rgb.Float(picture[..., i].array) for i in range(5)]
+    numbers = np.random.default_rng(4).uniform(size=(2, 2, 24 * 24)).astype(np.float32)
+    ray, _ = sensor.sample_ray_differential(0, 0.5, *map(rgb.Point2f, numbers))
+    with integrator.rendering_from(sensor, scene):
+        color, _, aovs = integrator.sample(scene, sensor.sampler(), ray)
+    return [*color, *aovs]
 
 
 def loss_of(rgb, scene, params=None):
     """A weighted sum of colours, depths times opacities, and opacities: depths of faint pixels jump at cut-offs."""
-    picture = rgb.render(scene, params, spp=1, seed=0)
-    weights = np.random.default_rng(3).uniform(0.2, 1, (5, 24, 24)).astype(np.float32)
-    channels = [picture[..., i] * (picture[..., 4] if i == 3 else 1) for i in range(5)]
-    return dr.mean(sum(rgb.TensorXf(w) * v for w, v in zip(weights, channels)), axis=None)
+    *color, depth, opacity = channels_of(rgb, scene, params)
+    weights = np.random.default_rng(3).uniform(0.2, 1, (5, 24 * 24)).astype(np.float32)
+    return dr.mean(sum(rgb.Float(w) * v for w, v in zip(weights, (*color, depth * opacity, opacity))))
 
 
+@pytest.mark.parametrize("kind", CAMERAS)
 @pytest.mark.parametrize("name", NAMES)
-def test_derivatives_of_images(rgb, no_tree, monkeypatch, name):
+def test_derivatives_of_images(rgb, no_tree, monkeypatch, name, kind):
     monkeypatch.setattr(splat_lists, "MIN_ALPHA", 1e-9)
-    scene = scene_of(rgb, cloud(60, size=1, width=0.06), extent=6.0)
+    scene = scene_of(rgb, cloud(60, size=1, width=0.06), 6.0, kind)
     params, h = rgb.traverse(scene), 2e-3
     before = rgb.Float(params[KEY + name])
     value = rgb.Float(before)
@@ -276,11 +297,18 @@ def test_derivatives_of_images(rgb, no_tree, monkeypatch, name):
     assert np.isclose((ends[0] - ends[1]) / (2 * h), np.linalg.norm(gradient), rtol=2e-2)
 
 
-def test_derivatives_of_images_with_respect_to_the_camera(rgb, no_tree, monkeypatch):
+@pytest.mark.parametrize("motion", ["translation", "rotation"])
+@pytest.mark.parametrize("kind", CAMERAS)
+def test_derivatives_of_images_with_respect_to_the_camera(rgb, no_tree, monkeypatch, kind, motion):
+    """Colours depend on the direction."""
     monkeypatch.setattr(splat_lists, "MIN_ALPHA", 1e-9)
-    scene = scene_of(rgb, cloud(60, degree=2, size=1, width=0.06), extent=6.0)
+    scene = scene_of(rgb, cloud(60, degree=2, size=1, width=0.06), 6.0, kind)
     params = rgb.traverse(scene)
-    pose = lambda x: rgb.Transform4f().translate(rgb.Vector3f(x, 0, 0)) @ rgb.Transform4f(look_at(rgb, (0.2, 0.1, -3)))
+    move = {
+        "translation": lambda x: rgb.Transform4f().translate(rgb.Vector3f(x, 0, 0)),
+        "rotation": lambda x: rgb.Transform4f().rotate(rgb.Vector3f(0, 1, 0), 20 * x),
+    }[motion]
+    pose = lambda x: move(x) @ rgb.Transform4f(look_at(rgb, (0.2, 0.1, -3)))
     x = rgb.Float(0)
     dr.enable_grad(x)
     put(params, "s.to_world", pose(x))

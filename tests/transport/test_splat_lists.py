@@ -12,7 +12,7 @@ from nerg_mi.maths.geometry import Similarity
 from nerg_mi.transport import splat_lists
 from nerg_mi.transport.geometry import SceneGeometry, SceneRay, default_march_settings
 from nerg_mi.transport.medium import ColorShader
-from nerg_mi.transport.splat_lists import Window, cube_windows
+from nerg_mi.transport.ray_cells import CubeCells, RayCells
 from nerg_mi.transport.splat_medium import MAX_ALPHA, SplatArrays, SplatMedium
 
 SH_C0 = 0.28209479177387814
@@ -55,12 +55,12 @@ def directions(count, seed=1):
     return d / np.linalg.norm(d, axis=1, keepdims=True)
 
 
-def trace(rgb, medium, center, d, start=0.0, windows=None):
+def trace(rgb, medium, center, d, start=0.0, cells=None):
     """Colour, opacity and mean depth (N, 5) of rays in the unit directions ``d`` from ``start`` in front of
-    ``center``; ``windows``: with lists."""
+    ``center``; ``cells``: with lists."""
     geometry = SceneGeometry(medium)
-    if windows is not None:
-        geometry = geometry.seen_from(rgb.Point3f(*map(float, center)), len(d), windows)
+    if cells is not None:
+        geometry = geometry.seen_from(rgb.Point3f(*map(float, center)), len(d), cells)
         assert isinstance(geometry.medium.hits, splat_lists.SplatLists)
     d = rgb.Vector3f(np.asarray(d, np.float32).T)
     ray = SceneRay(rgb.Point3f(*map(float, center)) + start * d, d, rgb.Float(dr.inf))
@@ -94,11 +94,11 @@ def sum_exactly(splats, center, d, start=0.0, stop=1e-4):
 
 
 @pytest.mark.parametrize("count", [1, 2, 100])
-@pytest.mark.parametrize("windows", [(), cube_windows(5)])
-def test_sums_equal_those_in_double_precision(rgb, sorted_hits, count, windows):
+@pytest.mark.parametrize("cells", [CubeCells(), CubeCells(5)])
+def test_sums_equal_those_in_double_precision(rgb, sorted_hits, count, cells):
     splats, d = cloud(count, width=0.2), directions(300)
     d[: count % 50] = splats.centers[: count % 50] / np.linalg.norm(splats.centers[: count % 50], axis=1, keepdims=True)
-    ours = trace(rgb, make_medium(rgb, splats), (0, 0, 0), d, windows=windows)
+    ours = trace(rgb, make_medium(rgb, splats), (0, 0, 0), d, cells=cells)
     exact = sum_exactly(splats, np.zeros(3), d)
     assert (exact[:, 3] > 0).sum() > (100 if count == 100 else 0)
     np.testing.assert_allclose(ours, exact, rtol=2e-4, atol=2e-4)
@@ -108,7 +108,7 @@ def test_gaussians_around_the_viewpoint_and_behind_the_start_of_rays(rgb, sorted
     # Near ones are wider than the view and reach behind the viewpoint; some contain it.
     splats, d = cloud(18, size=0.5, width=0.3), directions(400)
     for start in (0.0, 0.2):
-        ours = trace(rgb, make_medium(rgb, splats), (0, 0, 0), d, start, cube_windows(8))
+        ours = trace(rgb, make_medium(rgb, splats), (0, 0, 0), d, start, CubeCells(8))
         np.testing.assert_allclose(ours, sum_exactly(splats, np.zeros(3), d, start), rtol=5e-4, atol=5e-4)
 
 
@@ -116,7 +116,7 @@ def test_gaussians_around_the_viewpoint_and_behind_the_start_of_rays(rgb, sorted
 def test_units_and_places_far_from_the_origin(rgb, sorted_hits, unit, around):
     center = np.array([around, -around, around])
     splats, d = cloud(80, width=0.2, around=center, unit=unit), directions(300)
-    ours = trace(rgb, make_medium(rgb, splats), center * unit, d, windows=cube_windows(16))
+    ours = trace(rgb, make_medium(rgb, splats), center * unit, d, cells=CubeCells(16))
     exact = sum_exactly(splats, (center * unit).astype(np.float32).astype(np.float64), d)
     # Centres have seven digits.
     tolerance = 2e-4 + 5e-7 * abs(around)
@@ -130,13 +130,13 @@ def test_thin_and_faint_gaussians_are_listed_where_they_are_seen(rgb, sorted_hit
     scales = np.stack([np.full(300, 1e-5), np.full(300, 1e-4), np.full(300, 0.5)], axis=1)
     splats = Splats(splats.centers, scales, splats.rotations, rng.uniform(0.001, 0.01, 300), splats.harmonics)
     d = splats.centers / np.linalg.norm(splats.centers, axis=1, keepdims=True)
-    ours = trace(rgb, make_medium(rgb, splats), (0, 0, 0), d, windows=cube_windows(40))
+    ours = trace(rgb, make_medium(rgb, splats), (0, 0, 0), d, cells=CubeCells(40))
     exact = sum_exactly(splats, np.zeros(3), d)
     assert 50 < (exact[:, 3] > 0).sum() < 300  # some absorb less than a grey level
     np.testing.assert_allclose(ours, exact, atol=1e-3)
 
 
-def test_a_window_shows_what_the_cube_shows(rgb, sorted_hits):
+def test_a_plane_shows_what_the_cube_shows(rgb, sorted_hits):
     turned = np.linalg.qr(np.random.default_rng(5).normal(size=(3, 3)))[0]
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = 3 * turned * np.sign(np.linalg.det(turned)), (0.3, -0.2, 0.5)
@@ -146,9 +146,9 @@ def test_a_window_shows_what_the_cube_shows(rgb, sorted_hits):
     plane = np.random.default_rng(3).uniform([-0.8, -0.5], [0.8, 0.5], (500, 2))
     d = np.column_stack([plane, np.ones(500)]) @ turn
     d /= np.linalg.norm(d, axis=1, keepdims=True)
-    window = Window(turn, (-0.8, -0.5), (0.8, 0.5), (31, 17))
-    seen = trace(rgb, medium, center, d, windows=(window,))
-    np.testing.assert_allclose(seen, trace(rgb, medium, center, d, windows=()), atol=1e-5)
+    plane_cells = RayCells(turn, (-0.8, -0.5), (0.8, 0.5), (31, 17))
+    seen = trace(rgb, medium, center, d, cells=plane_cells)
+    np.testing.assert_allclose(seen, trace(rgb, medium, center, d, cells=CubeCells()), atol=1e-5)
     np.testing.assert_allclose(seen, trace(rgb, medium, center, d), atol=1e-2)
 
 
@@ -158,16 +158,16 @@ def test_the_order_on_surfaces_is_nearly_that_of_the_tree(rgb):
     radius = np.where(np.arange(6000) % 2, 1.5, 2)[:, None]  # a shell in front of another
     splats = Splats(radius * unit, splats.scales, splats.rotations, splats.opacities, splats.harmonics)
     medium = make_medium(rgb, splats)
-    difference = trace(rgb, medium, (0, 0, 0), d, windows=()) - trace(rgb, medium, (0, 0, 0), d)
+    difference = trace(rgb, medium, (0, 0, 0), d, cells=CubeCells()) - trace(rgb, medium, (0, 0, 0), d)
     assert np.sqrt((difference[:, :4] ** 2).mean()) < 0.005
 
 
 def test_moved_gaussians_are_listed_anew(rgb, sorted_hits):
     medium, d = make_medium(rgb, cloud(100, width=0.3)), directions(200)
-    first = trace(rgb, medium, (0, 0, 0), d, windows=())
+    first = trace(rgb, medium, (0, 0, 0), d, cells=CubeCells())
     medium.arrays.opacities = medium.arrays.opacities * 0.5
     medium.arrays.pack()
-    second = trace(rgb, medium, (0, 0, 0), d, windows=())
+    second = trace(rgb, medium, (0, 0, 0), d, cells=CubeCells())
     assert np.abs(second - first).max() > 0.1
     np.testing.assert_allclose(second, trace(rgb, medium, (0, 0, 0), d), atol=6e-3)
 
