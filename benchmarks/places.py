@@ -2,7 +2,7 @@
 
     python benchmarks/places.py [--only room,vr-office] [--folds 4] [--seed 0] [--prior-folds N] [--prior-kappa K]
         [--recipe default] [--variant VARIANT] [--no-surfaces] [--against FOLDS.csv] [--out out/benchmarks/places]
-    python benchmarks/places.py --uncertainty --folds 3 --zones 6 [--ensemble 5] [--out out/benchmarks/uncertainty]
+    python benchmarks/places.py --uncertainty --folds 3 --zones 6 [--out out/benchmarks/uncertainty]
 
 The scenes are recordings of a supermarket and of a VR office (with surfaces from hit points), recordings of EyeNavGS
 scenes (without geometry), the demo store's shoppers in its radiance field, and four generated scenes with walls and
@@ -19,8 +19,7 @@ folds.csv has the scores of each fold, for `--against`.
 positions of a zone are neighbours. The table has one row per scene: Spearman's rank correlation of low support with the
 error, at new positions and at all held-out positions, with 95 % intervals from resampled zones; the mean error at all
 positions and at the half with the most support; and the fraction of held-out rays in the smallest regions that contain
-80 % of the predicted gaze, before and after calibration on held-out training data. With ``--ensemble``, the spread of
-the members (AOV `gaze_std`) is ranked in the same way.
+80 % of the predicted gaze, before and after calibration on held-out training data.
 """
 
 from __future__ import annotations
@@ -182,13 +181,7 @@ def main(argv=None) -> None:
     parser.add_argument(
         "--uncertainty",
         action="store_true",
-        help="Evaluate whether support and spread predict the error of the field. Default: compare it with baselines.",
-    )
-    parser.add_argument(
-        "--ensemble",
-        type=int,
-        default=0,
-        help="Number of members of an ensemble in each fold; 0: a single field. Default: %(default)s.",
+        help="Evaluate whether support predicts the error of the field. Default: compare it with baselines.",
     )
     args = parse(parser, argv)
     if args.against is not None and not args.against.is_file():
@@ -240,7 +233,6 @@ def evaluate(name: str, make: Make, args: argparse.Namespace):
             seed=args.seed,
             test_zones=args.zones,
             splits="both,people" if args.uncertainty else "both",
-            ensemble=args.ensemble,
             prior_folds=args.prior_folds,
             output=folder / "eval",
             parallel=Parallel(threads=args.threads),
@@ -364,7 +356,6 @@ def uncertainty(name: str, result) -> list[dict]:
 def save_uncertainty(name: str, rows: list[dict], seeds: str) -> None:
     by = {(r["place"], r["signal"], r["split"], r["error"]): r for r in rows}
     places = list(dict.fromkeys(r["place"] for r in rows))
-    populations = {"new": "both", "any": "anywhere"}
 
     def rho(place: str, split: str, error: str) -> str:
         r = by.get((place, "support", split, error))
@@ -380,11 +371,6 @@ def save_uncertainty(name: str, rows: list[dict], seeds: str) -> None:
         table.append([place, *ranks, f"{r['100%']:.2f}, {r['50%']:.2f}", *regions])
     head = ["scene", "rho, KLD", "rho, excess KLD", "KLD: all, half with most support"]
     save_result(name, [*head, "coverage of 80 % regions", "calibrated"], table, seeds)
-    if any(r["signal"] == "spread" for r in rows):
-        pairs = [(name, signal) for name in populations for signal in ("support", "spread")]
-        rhos = [[f"{by[p, signal, populations[name], 'KLD']['rho']:+.2f}" for name, signal in pairs] for p in places]
-        head = ["scene", *(f"{name} positions: {signal}" for name, signal in pairs)]
-        save_result(f"{name}-spread", head, [[p, *row] for p, row in zip(places, rhos)], seeds)
 
 
 if __name__ == "__main__":
