@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from dataclasses import dataclass, field
@@ -59,6 +60,8 @@ class BrowserWindow:
         Whether a frame of a movement is being rendered.
     frame_version : int
         The ``version`` of the last frame.
+    outdated_since : float
+        Time from which on the displayed picture has been one of earlier contents; infinite if it is current.
     stale_reason : str
         Why the points are grey; "" if they are up to date.
     message : str
@@ -86,6 +89,7 @@ class BrowserWindow:
     shows_picture: bool = False
     is_frame_pending: bool = False
     frame_version: int = -1
+    outdated_since: float = math.inf
     stale_reason: str = ""
     message: str = ""
     free_position: np.ndarray | None = None
@@ -126,6 +130,9 @@ class BrowserWindow:
 
 TICK_SECONDS = 0.04
 """Interval of the clock, in seconds."""
+
+_MAX_OUTDATED_SECONDS = 0.5
+"""Seconds after which a picture of earlier contents gives way to the points, if no frame replaces it."""
 
 _GIZMO_DISTANCE = 0.4
 _POINT_SCALE = 1.15
@@ -285,9 +292,13 @@ class Page:
         changed."""
         window.version += 1
         window.change_time, window.is_handled = change_time, False
+        window.outdated_since = min(window.outdated_since, time.monotonic())
         self.session.cancel(window.client.client_id)
-        if self._start_frame(window):
-            return
+        if not self._start_frame(window):
+            self._show_points(window)
+
+    def _show_points(self, window: BrowserWindow) -> None:
+        """Display the points instead of an outdated picture."""
         if window.shows_picture:
             window.shows_picture = False
             with window.client.atomic():
@@ -320,6 +331,7 @@ class Page:
                 self._show_picture(window, picture, colors, 80)
                 window.frame_version = version
                 if window.version != version:
+                    window.outdated_since = time.monotonic()
                     self._start_frame(window)
 
         window.is_frame_pending = True
@@ -330,7 +342,7 @@ class Page:
         self, window: BrowserWindow, picture: StagePicture, colors: np.ndarray, jpeg_quality: int
     ) -> None:
         window.last_picture = picture, colors
-        window.shows_picture = True
+        window.shows_picture, window.outdated_since = True, math.inf
         with window.client.atomic():
             window.client.scene.set_background_image(colors, format="jpeg", jpeg_quality=jpeg_quality)
             if window.cloud is not None and window.cloud.visible:
@@ -524,6 +536,9 @@ class Page:
             if self._is_shares_update_pending:
                 self._is_shares_update_pending = not self.session.update_shares()
             for window in self.windows.values():
+                # Another task may keep a frame waiting.
+                if now - window.outdated_since > _MAX_OUTDATED_SECONDS:
+                    self._show_points(window)
                 self._update_status(window)
         stale_state = self.stale_scale_reason, self.session.are_shares_stale
         if stale_state != self._stale_state:

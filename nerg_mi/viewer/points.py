@@ -224,8 +224,12 @@ class BandPace:
 FRAME_SECONDS = 1 / 15
 """Target for the time of a frame during a movement, in seconds."""
 
-MAX_FRAME_SECONDS = 0.1
-"""Maximum time of a frame, in seconds; slower movements are shown by points."""
+MAX_FRAME_SECONDS = {False: 0.1, True: 0.2}
+"""Maximum time of a frame, in seconds, of a moving camera and of a moving observer; slower movements are shown by
+points. Those move with the camera at once, but the gaze of a moving observer is not on them."""
+
+_RETRY_SECONDS, _RETRY_FRAMES = 2.0, 50
+"""Times after which frames that were too slow are timed again, in seconds and as a multiple of their time."""
 
 _FRAME_OVERHEAD = 0.006
 """Time of a frame that does not depend on its size, in seconds: kernels are started, and the image is encoded."""
@@ -248,11 +252,13 @@ class FramePace:
         self._seconds: dict[tuple[bool, int], deque[float]] = {}
         # The last number of rays of each kind.
         self._last: dict[bool, int] = {}
+        self._last_time = 0.0
 
     def record(self, seconds: float, num_rays: int, is_view_kept: bool = False) -> None:
         """Record that a frame of ``num_rays`` rays took ``seconds``."""
         key = is_view_kept, num_rays
         self._counts[key] += 1
+        self._last_time = time.monotonic()
         if self._counts[key] > _NUM_SLOW_FRAMES:
             self._seconds.setdefault(key, deque(maxlen=5)).append(seconds)
             self._last[is_view_kept] = num_rays
@@ -278,7 +284,18 @@ class FramePace:
         lattices = [view.make_lattice(min(width, max_width), count) for width, count in FRAME_SIZES]
         seconds = [self.estimate(lattice.num_rays, is_view_kept) for lattice in lattices]
         fast = [lattice for lattice, estimate in zip(lattices, seconds) if estimate <= FRAME_SECONDS]
-        return fast[0] if fast else lattices[-1] if seconds[-1] <= MAX_FRAME_SECONDS else None
+        return fast[0] if fast else lattices[-1] if seconds[-1] <= MAX_FRAME_SECONDS[is_view_kept] else None
+
+    def start_retry(self, view: PinholeView, max_width: int, is_view_kept: bool = False) -> bool:
+        """Return whether frames that `choose_lattice` refuses should be timed again: other work may have slowed them
+        down. Once is enough until `record`."""
+        width, count = FRAME_SIZES[-1]
+        seconds = self.estimate(view.make_lattice(min(width, max_width), count).num_rays, is_view_kept)
+        now = time.monotonic()
+        is_due = math.isfinite(seconds) and now - self._last_time > max(_RETRY_SECONDS, _RETRY_FRAMES * seconds)
+        if is_due:
+            self._last_time = now
+        return is_due
 
 
 def refine(

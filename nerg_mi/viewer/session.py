@@ -468,8 +468,11 @@ class Session:
         frames."""
         if not self.has_drafts:
             return view.make_lattice(min(FRAME_SIZES[0][0], self.settings.width))
-        is_view_kept = view is self._last_view and self.observer is not self._last_observer
-        return self.frame_pace.choose_lattice(view, self.settings.width, is_view_kept)
+        options = view, self.settings.width, view is self._last_view and self.observer is not self._last_observer
+        lattice = self.frame_pace.choose_lattice(*options)
+        if lattice is None and self.frame_pace.start_retry(*options):
+            self.worker.submit("frame times", FRAME_PRIORITY, self._time_frames(view))
+        return lattice
 
     def render_frame(
         self,

@@ -149,6 +149,21 @@ class _Client:
         return threading.RLock()
 
 
+def test_frames_that_were_too_slow_are_timed_again(monkeypatch):
+    pace, now = FramePace(), [100.0]
+    monkeypatch.setattr("nerg_mi.viewer.points.time.monotonic", lambda: now[0])
+    num_rays = VIEW.make_lattice(320, 2).num_rays
+    for is_kept in (False, True):
+        # A moving observer has slower frames than a moving camera.
+        repeat(pace, 0.15, num_rays, is_kept)
+        assert (pace.choose_lattice(VIEW, 640, is_kept) is not None) == is_kept
+    assert not pace.start_retry(VIEW, 640)
+    now[0] += 60
+    assert pace.start_retry(VIEW, 640) and not pace.start_retry(VIEW, 640)
+    repeat(pace, 0.05, num_rays)
+    assert pace.choose_lattice(VIEW, 640) is not None
+
+
 def test_a_moving_view_shows_frames_if_they_are_fast(room, gaze_fields, make_session):
     session = make_session(room, gaze_fields[0], width=320, compile=False)
     assert session.worker.wait_idle(120)
