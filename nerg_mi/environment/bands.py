@@ -21,7 +21,7 @@ from nerg_mi.fields.radiance import RadianceNetwork
 from nerg_mi.maths.types import variant_types
 from nerg_mi.transport.field_medium import FieldMedium
 from nerg_mi.transport.geometry import SURFACE_OPACITY
-from nerg_mi.transport.recording import Recorder
+from nerg_mi.transport.recording import Recorder, lists_all_arrays
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -466,9 +466,13 @@ class _Strip:
 
 def _render_strip(scene, sensor, layers: LayerSource, grid: _PixelGrid, strip: _Strip, blocks: list[Any]) -> None:
     """Trace a strip of samples, or replay it, and add it to ``blocks``, one per layer."""
+    numbers, rays = strip.numbers, None
+    if layers.recorder is not None and not lists_all_arrays(sensor):
+        rays = _evaluate_rays(sensor, grid, strip)
+        numbers = [*numbers, *rays]
 
     def add() -> None:
-        positions, active, layer_values = _trace_strip(scene, sensor, layers, grid, strip)
+        positions, active, layer_values = _trace_strip(scene, sensor, layers, grid, strip, rays)
         for block, values in zip(blocks, layer_values):
             block.put(positions, values, active)
             if len(blocks) > 1:
@@ -480,10 +484,10 @@ def _render_strip(scene, sensor, layers: LayerSource, grid: _PixelGrid, strip: _
         return
     list_inputs = lambda: cast("RecordableLayers", layers).list_inputs(scene, strip.count)
     key = "strip", strip.count, grid.spp, grid.rows
-    layers.recorder.run(add, key, list_inputs, strip.numbers, sensor, blocks)
+    layers.recorder.run(add, key, list_inputs, numbers, sensor, blocks)
 
 
-def _trace_strip(scene, sensor, layers: LayerSource, grid: _PixelGrid, strip: _Strip):
+def _trace_strip(scene, sensor, layers: LayerSource, grid: _PixelGrid, strip: _Strip, rays: tuple[Any, Any] | None):
     """Trace a strip of samples.
 
     Follows ``SamplingIntegrator::render_sample`` of Mitsuba 3.9, operation by operation.
@@ -493,35 +497,61 @@ def _trace_strip(scene, sensor, layers: LayerSource, grid: _PixelGrid, strip: _S
     tuple
         Positions in the block of the band, the mask, and an iterator over the values in each layer.
     """
-    import drjit as dr
-
+    samples, film = _FilmSamples(sensor, grid, strip), sensor.film()
+    ray, weight = rays or samples.sample_rays()
+    layer_samples = layers.sample(scene, samples.sampler, ray, sensor.get_medium(), samples.active)
     mi = variant_types()
-    film = sensor.film()
-    sampler = make_sampler(grid.spp, strip.key, strip.first, strip.count)
-    number = dr.arange(mi.UInt32, strip.count)
-    active = number >= strip.masked
-    number = (number + strip.sample) // strip.spp + strip.column
-    line = number // grid.width
-    pixel = mi.Vector2i(number - line * grid.width, line + strip.row)
-    pixel += mi.Vector2i(film.crop_offset()) - grid.border
-
-    position = mi.Vector2f(pixel) + sampler.next_2d(active)
-    scale = dr.rcp(mi.ScalarVector2f(film.crop_size()))
-    offset = -mi.ScalarVector2f(film.crop_offset()) * scale
-    relative = mi.Point2f(dr.fma(position, mi.Vector2f(scale), mi.Vector2f(offset)))
-    aperture = sampler.next_2d(active) if sensor.needs_aperture_sample() else mi.Point2f(0.5)
-    time = sensor.shutter_open()
-    if sensor.shutter_open_time() > 0:
-        time = time + sampler.next_1d(active) * sensor.shutter_open_time()
-    ray, weight = sensor.sample_ray_differential(time, 0, relative, aperture, active)
-    if ray.has_differentials:
-        ray.scale_differential(mi.Float(np.float32(1) / np.sqrt(np.float32(grid.spp))))
-    layer_samples = layers.sample(scene, sampler, ray, sensor.get_medium(), active)
     # With a box filter, use the pixel itself: the position can be rounded up into the next pixel.
-    block_position = mi.Point2f(pixel) if film.rfilter().is_box_filter() else mi.Point2f(position)
+    block_position = mi.Point2f(samples.pixel if film.rfilter().is_box_filter() else samples.position)
     if grid.is_divided:
         block_position -= mi.Vector2f(mi.Vector2i(film.crop_offset()) + mi.Vector2i(0, strip.top))
-    return block_position, active, (_make_block_values(film, weight, *of_layer) for of_layer in layer_samples)
+    return block_position, samples.active, (_make_block_values(film, weight, *of_layer) for of_layer in layer_samples)
+
+
+def _evaluate_rays(sensor, grid: _PixelGrid, strip: _Strip) -> tuple[Any, Any]:
+    """The rays of the samples, and their weights, as evaluated arrays."""
+    import drjit as dr
+
+    rays = _FilmSamples(sensor, grid, strip).sample_rays()
+    dr.eval(rays)
+    return rays
+
+
+class _FilmSamples:
+    """Random samples of the pixels of a strip, and the ``sampler`` that continues them."""
+
+    def __init__(self, sensor, grid: _PixelGrid, strip: _Strip):
+        import drjit as dr
+
+        mi = variant_types()
+        film = sensor.film()
+        self.sampler = sampler = make_sampler(grid.spp, strip.key, strip.first, strip.count)
+        number = dr.arange(mi.UInt32, strip.count)
+        self.active = active = number >= strip.masked
+        number = (number + strip.sample) // strip.spp + strip.column
+        line = number // grid.width
+        pixel = mi.Vector2i(number - line * grid.width, line + strip.row)
+        self.pixel = pixel + (mi.Vector2i(film.crop_offset()) - grid.border)
+        self.position = mi.Vector2f(self.pixel) + sampler.next_2d(active)
+        self._aperture = sampler.next_2d(active) if sensor.needs_aperture_sample() else mi.Point2f(0.5)
+        self._time = sensor.shutter_open()
+        if sensor.shutter_open_time() > 0:
+            self._time += sampler.next_1d(active) * sensor.shutter_open_time()
+        self._sensor, self._spp = sensor, grid.spp
+
+    def sample_rays(self) -> tuple[Any, Any]:
+        """Rays of the samples, with differentials, and their weights."""
+        import drjit as dr
+
+        mi = variant_types()
+        film = self._sensor.film()
+        scale = dr.rcp(mi.ScalarVector2f(film.crop_size()))
+        offset = -mi.ScalarVector2f(film.crop_offset()) * scale
+        relative = mi.Point2f(dr.fma(self.position, mi.Vector2f(scale), mi.Vector2f(offset)))
+        ray, weight = self._sensor.sample_ray_differential(self._time, 0, relative, self._aperture, self.active)
+        if ray.has_differentials:
+            ray.scale_differential(mi.Float(np.float32(1) / np.sqrt(np.float32(self._spp))))
+        return ray, weight
 
 
 def _make_block_values(film, weight, radiance, valid, aovs) -> list:

@@ -18,7 +18,7 @@ from .geometry import SURFACE_OPACITY, SceneGeometry
 from .jit import Fingerprint, fingerprint_shapes, is_recording
 from .march_primal import MarchSettings
 from .ray_cells import CubeCells, LensCells, ParallelCells, RayCells
-from .recording import Recorder
+from .recording import Recorder, kind_of_sensor
 from .splat_lists import CAMERA_CELLS
 
 if TYPE_CHECKING:
@@ -207,7 +207,7 @@ def sensor_center(sensor: mi.Sensor) -> Point3f:
 
 def is_batch(sensor: mi.Sensor) -> bool:
     """Whether ``sensor`` is a batch of sensors."""
-    return _kind(sensor) == "BatchSensor"
+    return kind_of_sensor(sensor) == "BatchSensor"
 
 
 def _members(sensor: mi.Sensor) -> list[mi.Sensor]:
@@ -227,17 +227,11 @@ def _members(sensor: mi.Sensor) -> list[mi.Sensor]:
     return members
 
 
-def _kind(sensor: mi.Sensor) -> str:
-    # Sensors written in Python have their own class name.
-    name = type(sensor).__name__
-    return sensor.class_name() if name in ("Sensor", "ProjectiveCamera") else name
-
-
 def check_center(sensor: mi.Sensor, role: str) -> None:
     """Raise ``NergError`` if ``sensor`` (called ``role`` in the message) has no single centre."""
-    if _kind(sensor) not in _CENTERED:
+    if kind_of_sensor(sensor) not in _CENTERED:
         raise NergError(
-            f"{role} is of the type {_kind(sensor)}, which has no centre; "
+            f"{role} is of the type {kind_of_sensor(sensor)}, which has no centre; "
             'give the integrator an explicit "observer" such as a perspective sensor'
         )
 
@@ -255,7 +249,7 @@ def have_same_center(sensors: Sequence[mi.Sensor], p_o: Point3f) -> bool:
     """
     if is_recording():
         return False
-    centers = [sensor_center(m) for s in sensors for m in _members(s) if _kind(m) in _CENTERED]
+    centers = [sensor_center(m) for s in sensors for m in _members(s) if kind_of_sensor(m) in _CENTERED]
     count = sum(len(_members(s)) for s in sensors)
     return len(centers) == count > 0 and all(bool(dr.all(dr.detach(c) == dr.detach(p_o))) for c in centers)
 
@@ -269,7 +263,7 @@ def camera_cells(sensor: mi.Sensor) -> RayCells | None:
     """The rays of ``sensor`` around its `sensor_center`, in cells of a few pixels; None for other kinds of sensors."""
     import mitsuba as mi
 
-    kind, film, camera = _kind(sensor), sensor.film(), cast("Any", sensor)
+    kind, film, camera = kind_of_sensor(sensor), sensor.film(), cast("Any", sensor)
     if kind == "Panorama":
         return CubeCells()
     if kind not in ("PerspectiveCamera", "ThinLensCamera", "OrthographicCamera"):

@@ -232,22 +232,38 @@ def _get_callback_class(variant: str) -> type:
     return ParameterCallback
 
 
-# Mitsuba 3.9.1 does not list all arrays of other cameras, such as "thinlens" and "orthographic".
-_SENSORS = ("PerspectiveCamera", "Panorama")
+# Of other cameras, Mitsuba 3.9.1 does not list all arrays.
+_LISTED_SENSORS = ("PerspectiveCamera", "Panorama")
+_OTHER_SENSORS = ("ThinLensCamera", "OrthographicCamera")
+
+
+def lists_all_arrays(sensor: Any) -> bool:
+    """Whether a recording can sample rays of ``sensor``; those of others must be inputs."""
+    return kind_of_sensor(sensor) in _LISTED_SENSORS
+
+
+def kind_of_sensor(sensor: Any) -> str:
+    """The name of the class of ``sensor``."""
+    # Sensors written in Python have their own class name.
+    name = type(sensor).__name__
+    return sensor.class_name() if name in ("Sensor", "ProjectiveCamera") else name
 
 
 def _list_sensor(state: State, sensor: Any) -> None:
-    """Add the values of a ``sensor`` and its film that are not arrays."""
+    """Add a ``sensor``, or its position if its rays are inputs, and what they have that is not an array."""
     import mitsuba as mi
 
-    kind = type(sensor).__name__
-    kind = sensor.class_name() if kind in ("Sensor", "ProjectiveCamera") else kind
-    if kind not in _SENSORS:
+    kind = kind_of_sensor(sensor)
+    if kind not in _LISTED_SENSORS + _OTHER_SENSORS:
         raise NotRecordable(f"a sensor of the type {kind}")
     if sensor.get_medium() is not None:
         raise NotRecordable("a sensor inside a medium")
     if isinstance(sensor, mi.ProjectiveCamera):
         state.key += (sensor.near_clip(), sensor.far_clip())
+    if kind in _LISTED_SENSORS:
+        state.natives.append(sensor)
+    else:
+        state.arrays.append(sensor.world_transform().matrix)
     film = sensor.film()
     state.key += (kind, film.class_name(), str(film), str(film.rfilter()), film.flags())
     state.key += (sensor.needs_aperture_sample(), sensor.shutter_open(), sensor.shutter_open_time())
@@ -384,7 +400,7 @@ class Recorder:
             return body()
         self.is_replaying = True
         try:
-            return recording(body, arrays, [sensor, *blocks, *state.natives])
+            return recording(body, arrays, [*blocks, *state.natives])
         finally:
             self.is_replaying = False
 

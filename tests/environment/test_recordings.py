@@ -59,8 +59,8 @@ def nerg_pixel():
     return sys.modules[get_plugin_class("nerg").__module__ + "_pixel"]
 
 
-def make_scene(mi, files, gaze="hits", **overrides):
-    settings = {
+def make_settings(mi, files, gaze="hits", **overrides):
+    return {
         "gaze": stored("gazefield", files / f"{gaze}.safetensors"),
         "aovs": "depth,opacity,gaze,visibility,observer_depth,support,position",
         "observer": make_observer(mi, -2, 0.3, -2),
@@ -70,8 +70,11 @@ def make_scene(mi, files, gaze="hits", **overrides):
         "jitter": True,
         **overrides,
     }
-    sensor = camera(mi, size=9)
-    return scene_with(mi, with_field(files, **settings), sensor)
+
+
+def make_scene(mi, files, *args, **overrides):
+    settings = make_settings(mi, files, *args, **overrides)
+    return scene_with(mi, with_field(files, **settings), camera(mi, size=9))
 
 
 def image(scene, sensor, spp, seed, layers=None):
@@ -502,11 +505,11 @@ def test17_scenes_are_freed_with_their_recordings(rgb, files, is_lit):
 # ---- Splats and volumes ----
 
 
-def make_medium_scene(mi, files, kind, visibility="depth"):
+def make_medium_scene(mi, files, medium, visibility="depth", **lens):
     """Splats, as lists or as a tree, a grid of densities, or a radiance field as a density."""
     data, grid = np.random.default_rng(2).uniform(0, 4, (5, 6, 7)).astype(np.float32), {"type": "gridvolume"}
     box = mi.ScalarTransform4f().translate([-0.5, -0.5, -0.5])
-    medium = {
+    children = {
         "lists": {"field": stored("splats", files / "splats.ply")},
         "tree": {"field": stored("splats", files / "splats.ply", lists=False)},
         "grid": {
@@ -514,7 +517,7 @@ def make_medium_scene(mi, files, kind, visibility="depth"):
             "color": {**grid, "grid": mi.VolumeGrid(np.stack([data / 4] * 3, -1)), "to_world": box},
         },
         "field": {"density": stored("nerf", files / "field.safetensors")},
-    }[kind]
+    }[medium]
     integrator = {
         "type": "nerg",
         "gaze": stored("gazefield", files / "gaze.safetensors"),
@@ -524,9 +527,9 @@ def make_medium_scene(mi, files, kind, visibility="depth"):
         "visibility": visibility,
         "directions": 512,
         "map_height": 16,
-        **medium,
+        **children,
     }
-    return scene_with(mi, integrator, camera(mi, size=9))
+    return scene_with(mi, integrator, camera(mi, size=9, **lens))
 
 
 def change_medium(mi, scene, rng):
@@ -583,18 +586,61 @@ def test18_gaussians_that_exchange_their_places_are_replayed(rgb, files, count_t
     assert count_traces() <= before + 6 + 3
 
 
+LENSES = {
+    "thinlens": {"kind": "thinlens", "aperture_radius": 0.1, "focus_distance": 3},
+    "orthographic": {"kind": "orthographic"},
+}
+
+
+@pytest.mark.parametrize("lens", LENSES)
+@pytest.mark.parametrize("has_own_observer", [True, False])
+def test19_rays_of_other_cameras_are_sampled_before(rgb, files, count_traces, lens, has_own_observer):
+    """Mitsuba 3.9.1 does not list all arrays of these cameras."""
+    names = "depth,gaze,visibility,position" if has_own_observer or lens == "thinlens" else "depth,position"
+    settings = make_settings(rgb, files, aovs=names)
+    if not has_own_observer:
+        del settings["observer"]
+    sensor = {**camera(rgb, size=9, **LENSES[lens]), "shutter_close": 0.5}
+    scene, rng = scene_with(rgb, with_field(files, **settings), sensor), np.random.default_rng(4)
+    for number in range(8):
+        move_camera(rgb, scene, rng)
+        if has_own_observer:
+            move_observer(rgb, scene, rng)
+        if lens == "thinlens":
+            params = rgb.traverse(scene)
+            params["sensor.aperture_radius"] = float(rng.uniform(0.01, 0.2))
+            put(params, "sensor.focus_distance", float(rng.uniform(1, 4)))
+        if number >= 4:
+            change_film(rgb, scene, np.random.default_rng(1))
+        before = count_traces()
+        replayed = image(scene, scene.sensors()[0], 2, number)
+        assert (count_traces() > before) == (number % 4 < 2)
+        assert np.array_equal(replayed, np.array(rgb.render(scene, spp=2, seed=number)))
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test20_lists_of_other_cameras_are_replayed(rgb, files, lens, count_traces, monkeypatch):
+    monkeypatch.setattr(splat_lists, "MIN_GAUSSIANS", 1)
+    write_ply_splats(files / "splats.ply", random_splats(60, degree=1))
+    scene, rng = make_medium_scene(rgb, files, "lists", **LENSES[lens]), np.random.default_rng(4)
+    before = count_traces()
+    for seed in range(8):
+        move_camera(rgb, scene, rng)
+        move_observer(rgb, scene, rng)
+        render_both(rgb, scene, seed)
+    # Mitsuba traces each image.
+    assert count_traces() <= before + 8 + 3
+
+
 # ---- What cannot be recorded ----
 
 
-@pytest.mark.parametrize(
-    "lens", [{"kind": "thinlens", "aperture_radius": 0.1, "focus_distance": 3}, {"kind": "orthographic"}]
-)
 @pytest.mark.parametrize("is_refused", [True, False])
-def test14_arrays_that_are_not_listed_are_traced(rgb, files, recwarn, monkeypatch, lens, is_refused):
-    """Mitsuba 3.9.1 does not list all arrays of these cameras, as may also be the case for other plugins."""
-    if not is_refused:
-        monkeypatch.setattr(recording, "_SENSORS", ("ThinLensCamera", "OrthographicCamera"))
-    scene = scene_with(rgb, with_field(files, aovs="depth"), camera(rgb, size=6, **lens))
+def test14_arrays_that_are_not_listed_are_traced(rgb, files, recwarn, monkeypatch, is_refused):
+    """As may be the case for other plugins."""
+    kinds = "_OTHER_SENSORS", "_LISTED_SENSORS"
+    monkeypatch.setattr(recording, kinds[not is_refused], () if is_refused else ("ThinLensCamera",))
+    scene = scene_with(rgb, with_field(files, aovs="depth"), camera(rgb, size=6, **LENSES["thinlens"]))
     for seed in range(4):
         assert np.array_equal(nerg.render_tensor(scene, seed=seed), rgb.render(scene, seed=seed))
     (warning,) = recwarn
