@@ -21,23 +21,7 @@ from tests.plugins.scenes import camera, look_at, make_observer, scene_with
 STOP = 1e-4
 ORIGIN = (0.5, 0.4, -3)
 
-
-@pytest.fixture(autouse=True)
-def any_number(monkeypatch):
-    """Lists for any number of Gaussians and rays, in which so many hits wait that their order is that of the peaks."""
-    monkeypatch.setattr(splat_lists, "MIN_GAUSSIANS", 1)
-    monkeypatch.setattr(splat_lists, "MIN_RAYS_PER_GAUSSIAN", 0)
-    monkeypatch.setattr(splat_lists, "NUM_WAITING", 24)
-
-
-@pytest.fixture
-def no_tree(monkeypatch):
-    """No ray searches the tree."""
-
-    def refuse(*args):
-        raise AssertionError("the tree was searched")
-
-    monkeypatch.setattr(splat_lists.SplatLists, "find_next", refuse)
+pytestmark = pytest.mark.usefixtures("any_number", "sorted_hits")
 
 
 def orthographic(mi, *sizes):

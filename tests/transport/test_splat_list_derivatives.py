@@ -10,7 +10,7 @@ from nerg_mi.fields.mlp import namespace
 from nerg_mi.fields.splats import Splats, quaternions_to_matrices
 from nerg_mi.maths.sphere import eval_harmonics
 from nerg_mi.registration import get_plugin_class
-from nerg_mi.transport import splat_lists, splat_medium
+from nerg_mi.transport import splat_lists
 from nerg_mi.transport.geometry import SceneGeometry, SceneRay, default_march_settings
 from nerg_mi.transport.medium import ColorShader
 from nerg_mi.transport.splat_medium import MAX_ALPHA, SplatArrays, SplatMedium
@@ -19,24 +19,7 @@ from tests.plugins.scenes import camera, look_at, put, still
 NAMES = ("centers", "scales", "rotations", "opacities", "harmonics")
 STOP = 1e-4
 
-
-@pytest.fixture(autouse=True)
-def any_number(monkeypatch):
-    """Lists for any number of Gaussians and rays, in which so many hits wait that their order is that of the peaks."""
-    monkeypatch.setattr(splat_lists, "MIN_GAUSSIANS", 1)
-    monkeypatch.setattr(splat_lists, "MIN_RAYS_PER_GAUSSIAN", 0)
-    monkeypatch.setattr(splat_lists, "NUM_WAITING", 24)
-
-
-@pytest.fixture
-def no_tree(monkeypatch):
-    """No ray searches the tree, which is not even built."""
-
-    def refuse(*args):
-        raise AssertionError("the tree was searched or built")
-
-    monkeypatch.setattr(splat_lists.SplatLists, "find_next", refuse)
-    monkeypatch.setattr(splat_medium, "build_tree", refuse)
+pytestmark = pytest.mark.usefixtures("any_number", "sorted_hits")
 
 
 def cloud(count, degree=1, seed=0, size=2.0, width=0.2, opacities=(0.05, 0.95)):

@@ -17,18 +17,7 @@ from nerg_mi.transport.splat_medium import MAX_ALPHA, SplatArrays, SplatMedium
 
 SH_C0 = 0.28209479177387814
 
-
-@pytest.fixture(autouse=True)
-def any_number(monkeypatch):
-    """Lists for any number of Gaussians and rays."""
-    monkeypatch.setattr(splat_lists, "MIN_GAUSSIANS", 1)
-    monkeypatch.setattr(splat_lists, "MIN_RAYS_PER_GAUSSIAN", 0)
-
-
-@pytest.fixture
-def sorted_hits(monkeypatch):
-    """So many hits wait that the order along rays is that of their peaks."""
-    monkeypatch.setattr(splat_lists, "NUM_WAITING", 20)
+pytestmark = pytest.mark.usefixtures("any_number")
 
 
 def cloud(count, seed=0, around=(0.0, 0.0, 0.0), size=2.0, width=0.08, unit=1.0):
