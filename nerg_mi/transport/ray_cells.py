@@ -18,6 +18,7 @@ from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.types import Array3f, Float, Point3f, UInt32, Vector3f
 
 _MAX_APERTURE_TILES = 8  # Along each edge of the square around the aperture
+_MAX_BOUNDS = 1 << 26  # Bounds of ellipsoids in all tiles, of 16 bytes each
 _ROUNDING = 2.0**-20  # Relative error of origins of rays by which apertures are extended
 
 
@@ -256,7 +257,8 @@ class LensCells(RayCells):
         adapted = copy(self)
         # The blur far behind the plane in cells: cells that are much smaller only make more lists longer.
         blur = 2 * self.radius / self.focus * self.cells[0] / (self.upper[0] - self.lower[0])
-        adapted._tiles = int(np.clip(np.ceil(1.4 * np.sqrt(blur)), 1, _MAX_APERTURE_TILES))
+        max_tiles = int(np.clip(np.sqrt(_MAX_BOUNDS / num_gaussians), 1, _MAX_APERTURE_TILES))
+        adapted._tiles = int(np.clip(np.ceil(1.4 * np.sqrt(blur)), 1, max_tiles))
         size = max(blur / adapted._tiles, 1)
         nu, nv = (max(round(n / size), 1) for n in self.cells)
         adapted.cells = nu, nv

@@ -310,7 +310,7 @@ def _list_members(bounds: Rectangles, order: np.ndarray, cells: tuple[int, int])
 
 @dataclass
 class ListHit:
-    """A Gaussian on a ray: distance from the viewpoint, absorbed fraction (0: none) and rank."""
+    """A Gaussian on a ray: distance as by `SplatLists.locate`, absorbed fraction (0: none) and rank."""
 
     t: Float
     alpha: Float
@@ -391,6 +391,7 @@ MIN_RAYS_PER_GAUSSIAN = 1 / 16
 
 _MAX_ENTRIES = 1 << 25  # Entries of the lists of rays without a centre, which can be long for blurred Gaussians
 _MAX_NUMBERS = 1 << 26  # Numbers in the lists of earlier viewpoints that a medium keeps, 4 bytes each
+_MAX_VIEWPOINTS = 256  # Earlier viewpoints that a medium keeps, of which some have no lists
 
 
 def list_splats(medium: SplatMedium, center: Point3f, rays: int, cells: RayCells) -> SplatMedium:
@@ -420,7 +421,10 @@ def list_splats(medium: SplatMedium, center: Point3f, rays: int, cells: RayCells
         is_small = cells.has_center or sum(int(r.count.sum(dtype=np.int64)) for r in rectangles) <= _MAX_ENTRIES
         lists = SplatLists(arrays, position, cells, rectangles) if is_small else None
         # The lists of a camera and of an observer are kept in any case.
-        while len(medium.lists) > 1 and sum(other.size for _, other in medium.lists.values() if other) > _MAX_NUMBERS:
+        while len(medium.lists) > 1 and (
+            len(medium.lists) >= _MAX_VIEWPOINTS
+            or sum(other.size for _, other in medium.lists.values() if other) > _MAX_NUMBERS
+        ):
             del medium.lists[next(iter(medium.lists))]
     medium.lists[key] = made_of, lists
     if lists is None:

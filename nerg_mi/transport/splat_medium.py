@@ -340,7 +340,7 @@ class SplatMedium:
     """Gaussian splats placed in the scene: a `medium.Medium` in their own coordinates.
 
     ``to_world``: splats to scene; default: the identity. ``color_space``: ``srgb``, as trained from photos, or
-    ``linear``. ``may_list``: whether rays from one point may read lists (`splat_lists.list_splats`).
+    ``linear``. ``may_list``: whether rays of a camera or an observer may read lists (`splat_lists.list_splats`).
     """
 
     UNRECORDED = ("lists",)

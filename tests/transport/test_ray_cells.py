@@ -21,6 +21,7 @@ KINDS = {
     "lens": LensCells(*PLANE, radius=0.05, focus=FOCUS).adapt(1, np.zeros(3)),
     "one tile": LensCells(*PLANE, radius=0.4, focus=FOCUS),
     "large lens": LensCells(*PLANE, radius=0.8, focus=FOCUS).adapt(1, np.zeros(3)),
+    "few tiles": LensCells(*PLANE, radius=0.8, focus=FOCUS).adapt(1 << 24, np.zeros(3)),
 }
 
 
@@ -98,3 +99,9 @@ def test_a_small_lens_bounds_as_a_point(rgb):
     ellipsoids = Ellipsoids(array(center), [array(semi_axes[:, :, i]) for i in range(3)], ns.Float(square))
     bound = lambda cells: np.array([v for b in cells.prepare(ns).bound(ellipsoids, 0) for v in b])
     np.testing.assert_allclose(bound(LensCells(*PLANE, radius=1e-9, focus=FOCUS)), bound(RayCells(*PLANE)), atol=1e-3)
+
+
+def test_bounds_of_many_ellipsoids_have_little_memory():
+    lens = LensCells(*PLANE, radius=2.0, focus=FOCUS)
+    tiles = [lens.adapt(count, np.zeros(3)).num_faces for count in (1, 1 << 20, 1 << 24, 1 << 28)]
+    assert tiles == [64, 64, 4, 1]

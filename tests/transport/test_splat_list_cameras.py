@@ -195,6 +195,11 @@ def test_lists_that_would_be_too_long_are_not_made(rgb, monkeypatch):
         assert not isinstance(seen.medium.hits, splat_lists.SplatLists)
     near = geometry.seen_from(sensor_center(sensor), 1000)
     assert isinstance(near.medium.hits, splat_lists.SplatLists)
+    # That there are none is not recorded for ever more cameras.
+    monkeypatch.setattr(splat_lists, "_MAX_VIEWPOINTS", 3)
+    for k in range(5):
+        geometry.seen_from(rgb.Point3f(k, 0, -3), 1000, camera_cells(sensor))
+    assert len(geometry.medium.lists) == 3
 
 
 # ---- Images ----
