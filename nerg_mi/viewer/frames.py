@@ -79,8 +79,8 @@ def render_frame(
     is_observer_at_rest : bool
         Whether a coarse map around the observer has the gaze of a draft. It is kept, and takes as long as a frame.
     is_view_at_rest : bool
-        Whether a draft for a moving observer has the colours and surfaces of all pixels in the settings of the scene.
-        They are kept, and only what the observer sees is computed again.
+        Whether a draft for a moving observer has the colours and surfaces of all pixels in the settings of the scene,
+        if the layer can keep them: only what the observer sees is computed again.
 
     Returns
     -------
@@ -91,7 +91,7 @@ def render_frame(
     """
     start, integrator = time.perf_counter(), scene.integrator
     settings, observed, medium = integrator.settings, integrator.observer_settings, integrator.medium
-    is_view_kept = is_draft and is_view_at_rest and not is_observer_at_rest
+    is_view_kept = is_draft and is_view_at_rest and not is_observer_at_rest and layer.can_keep_view
     if is_draft and not is_view_kept and isinstance(medium, SplatMedium):
         settings = replace(settings, stop=max(settings.stop, _SPLAT_STOP))
     elif is_draft and not is_view_kept and medium is not None and medium.is_density_separate:
@@ -147,8 +147,6 @@ class _Frame:
         """Displayed colours (height, width, 3) uint8."""
         context, layer, lattice = self.context, self.layer, self.lattice
         eye = context.make_observer(observer, True) if context.observer_aovs else None
-        # Numbers of evaluations are those of both rays.
-        is_view_kept = is_view_kept and layer.depends_on_observer and "counts" not in context.required_data
         cached = self._keep_view() if is_view_kept else None
 
         def list_inputs() -> list[Any]:
@@ -156,7 +154,7 @@ class _Frame:
                 eye.prepare(context, self.scene.mitsuba, [], lattice.num_rays)
             return [*self._list_inputs(is_traced=cached is None), eye]
 
-        kind = "frame", lattice, layer.title, layer.kind, is_view_kept
+        kind = "frame", lattice, layer.title, layer.kind, self._count, is_view_kept
         run = context.nerg.recorder.run
         (packed,) = run(lambda: [self._paint(eye, cached)], kind, list_inputs, [*self._numbers, *(cached or [])])
         pixels = packed.numpy().view(np.uint8).reshape(lattice.height, lattice.width, 4)
@@ -224,7 +222,7 @@ class _Frame:
             x = index - y * self.lattice.numbers[0]
             if self.lattice.pixels_per_ray > 1:
                 dr.eval(color, opacity, value)
-                value = self.lattice.interpolate(value, x, y)
+                value = self.lattice.interpolate(value, x, y, self.layer.kind != "categorical")
             if cached is None:
                 color, opacity = (self.lattice.interpolate(v, x, y) for v in (color, opacity))
             else:
@@ -246,6 +244,7 @@ class _Frame:
         # NaN becomes 0.
         place = (dr.select(dr.isnan(value[0]), 0, value[0]) - self._steps[0]) * self._steps[1]
         if self.layer.kind == "categorical":
+            place = dr.round(place)
             place -= self._count * dr.floor(place / self._count)
         row = mi.UInt32(dr.clip(place, 0, self._count - 1) + 0.5)
         a, b, c = (dr.gather(mi.Vector3f, self._table, 3 * row + k) for k in range(3))

@@ -52,11 +52,11 @@ class Lattice:
         y = row * step_y
         return (ray - row * columns) * step_x + (y & shift), y
 
-    def interpolate(self, channels: list[Any], x: Any, y: Any) -> list[Any]:
+    def interpolate(self, channels: list[Any], x: Any, y: Any, has_mean: bool = True) -> list[Any]:
         """Values of the pixels (x, y) from those of all rays, which are evaluated unless they are those of all pixels.
 
-        A pixel without a ray has the mean of two opposite neighbours: those that differ least, so that edges stay
-        sharp.
+        A pixel without a ray has the mean of two opposite neighbours, or the value of one if numbers of classes have no
+        mean: of those that differ least, so that edges stay sharp.
         """
         import drjit as dr
 
@@ -78,7 +78,7 @@ class Lattice:
             steps = (x & 1, y & 1), (x & 1, -(y & 1))
         pairs = [(gather(i, j), gather(-i, -j)) for i, j in steps]
         first, second = (sum(dr.abs(a - b) for a, b in zip(*pair)) for pair in pairs)
-        means = ([0.5 * (a + b) for a, b in zip(*pair)] for pair in pairs)
+        means = ([0.5 * (a + b) if has_mean else a for a, b in zip(*pair)] for pair in pairs)
         return [dr.select(first < second, a, b) for a, b in zip(*means)]
 
 

@@ -60,6 +60,12 @@ class Layer:
         """Whether the values depend on the observer."""
         return self.overlay is not None and AOVS[self.quantity].is_per_observer
 
+    @property
+    def can_keep_view(self) -> bool:
+        """Whether another observer changes nothing but the values on the surfaces of the view. Numbers of evaluations
+        are those of the view, too."""
+        return self.depends_on_observer and "counts" not in AOVS[self.quantity].required_data
+
     def select_values(self, by_quantity: Mapping[str, np.ndarray]) -> np.ndarray | None:
         """Select the values of this layer.
 

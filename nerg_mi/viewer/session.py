@@ -468,7 +468,8 @@ class Session:
         frames."""
         if not self.has_drafts:
             return view.make_lattice(min(FRAME_SIZES[0][0], self.settings.width))
-        options = view, self.settings.width, view is self._last_view and self.observer is not self._last_observer
+        is_view_kept = view is self._last_view and self.observer is not self._last_observer
+        options = view, self.settings.width, is_view_kept and self.display.layer.can_keep_view
         lattice = self.frame_pace.choose_lattice(*options)
         if lattice is None and self.frame_pace.start_retry(*options):
             self.worker.submit("frame times", FRAME_PRIORITY, self._time_frames(view))

@@ -60,15 +60,16 @@ def test_layers_of_further_frames_equal_traces(scene, name):
 
 @pytest.mark.parametrize("name", ["gaze", "visibility", "observer_depth", "density_evals"])
 def test_frames_of_a_moving_observer_equal_traces(scene, name):
-    """Colours and surfaces of the view are computed for the first one only."""
-    layer, view, scale = layers.get_layer(name), PinholeView.from_sensor(scene.resolve_sensor(0)), None
-    for ceiling in (None, Ceiling(0.6)):
-        for k in range(4):
-            eye = np.array([0.1 * k, 0.2, 0.5])
-            with override_attribute(scene, "ceiling", ceiling):
-                expected, scale = trace_colors(scene, view, eye, layer, scale)
-            colors = draw(scene, view, eye, layer, scale, is_view_at_rest=True, ceiling=ceiling)
-            assert is_close(colors, expected), k
+    """Colours and surfaces are computed once for each view and ceiling."""
+    layer, home, scale = layers.get_layer(name), PinholeView.from_sensor(scene.resolve_sensor(0)), None
+    views = [replace(home, origin=home.origin + np.array([0, 0.1 * k, 0])) for k in range(3)]
+    views.append(views[-1])
+    for k in range(8):
+        view, ceiling, eye = views[k // 2], Ceiling(0.6) if k > 5 else None, np.array([0.1 * k, 0.2, 0.5])
+        with override_attribute(scene, "ceiling", ceiling):
+            expected, scale = trace_colors(scene, view, eye, layer, scale)
+        colors = draw(scene, view, eye, layer, scale, is_view_at_rest=True, ceiling=ceiling)
+        assert is_close(colors, expected), k
 
 
 @pytest.mark.parametrize("is_view_at_rest", [False, True])
@@ -90,9 +91,10 @@ def test_classes_use_their_colours(room_scene):
     depth = layers.get_layer("depth")
     shown = replace(depth.overlay.quantity, display=replace(depth.overlay.display, kind="categorical", cmap=None))
     layer = layers.Layer(replace(depth.overlay, quantity=shown))
-    view = PinholeView.from_sensor(room_scene.resolve_sensor(0))
-    expected, scale = trace_colors(room_scene, view, view.origin, layer, None)
-    assert is_close(draw(room_scene, view, view.origin, layer, scale), expected)
+    view = PinholeView.look_at((-10, 0, 2), (0, 0, 0), (0, 0, 1), 0.5, 1.5)
+    for colors in (None, None, None, "tab10"):  # The third one is a replay.
+        expected, scale = trace_colors(room_scene, view, view.origin, layer, layers.choose_scale(layer, None, colors))
+        assert is_close(draw(room_scene, view, view.origin, layer, scale), expected), colors
 
 
 def test_a_ceiling_and_drafts(scene):
@@ -140,3 +142,13 @@ def test_only_drafts_are_timed(room_scene):
         assert pace.estimate(100) == np.inf
         render_frame(room_scene, view, view.origin, layer, scale, view.make_lattice(WIDTH), pace, is_draft=is_draft)
     assert 0 < pace.estimate(100) < pace.estimate(1000) < np.inf
+
+
+@pytest.mark.parametrize("name", ["color", "depth", "density_evals", "gaze"])
+def test_only_frames_that_keep_their_view_are_timed_as_such(scene, name):
+    layer, view, pace = layers.get_layer(name), PinholeView.from_sensor(scene.resolve_sensor(0)), FramePace()
+    for k in range(3):
+        eye, scale = np.array([0.1 * k, 0.2, 0.5]), layers.choose_scale(layer, None, None)
+        render_frame(scene, view, eye, layer, scale, view.make_lattice(WIDTH), pace, is_view_at_rest=True)
+    # Other frames have no times yet.
+    assert (pace.estimate(100) == np.inf) is (name == "gaze") and pace.estimate(100, True) < np.inf

@@ -16,7 +16,7 @@ def traced_pixels(width, height, pixels_per_ray):
     return {1: x >= 0, 2: (x + y) % 2 == 0, 4: (x % 2 == 0) & (y % 2 == 0)}[pixels_per_ray]
 
 
-def interpolate(lattice, image):
+def interpolate(lattice, image, **options):
     """``image`` (height, width) from its values at the rays of ``lattice``."""
     import drjit as dr
     import mitsuba as mi
@@ -25,7 +25,7 @@ def interpolate(lattice, image):
     is_inside = (x < lattice.width) & (y < lattice.height)
     values = np.where(is_inside, image[np.minimum(y, lattice.height - 1), np.minimum(x, lattice.width - 1)], np.nan)
     rows, columns = (mi.UInt32(v.ravel().astype(np.uint32)) for v in np.indices(image.shape))
-    (pixels,) = lattice.interpolate([mi.Float(values.astype(np.float32))], columns, rows)
+    (pixels,) = lattice.interpolate([mi.Float(values.astype(np.float32))], columns, rows, **options)
     return pixels.numpy().reshape(image.shape)
 
 
@@ -58,3 +58,10 @@ def test_edges_stay_sharp(rgb):
     for axis in (0, 1):
         image = (np.indices((6, 8))[axis] > 2).astype(float)
         np.testing.assert_array_equal(interpolate(Lattice(8, 6, 2), image), image)
+
+
+@pytest.mark.parametrize("pixels_per_ray", [2, 4])
+def test_classes_are_not_mixed(rgb, pixels_per_ray):
+    classes, lattice = np.random.default_rng(0).choice([1, 10, 100], (6, 8)), Lattice(8, 6, pixels_per_ray)
+    assert np.isin(interpolate(lattice, classes, has_mean=False), classes).all()
+    assert not np.isin(interpolate(lattice, classes), classes).all()
