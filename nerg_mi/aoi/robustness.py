@@ -553,7 +553,8 @@ def robustness(
         single = np.isin(np.arange(len(names)), AoiContext(placed, counting).transition_areas)
         evaluation = Evaluation(names, placed.members, single, resamples, seed)
         ranks, estimates = dict[str, np.ndarray](), []
-        for choice, result in zip(table, results):
+        # Strict, so that the results end before the conclusions are counted.
+        for choice, result in zip(table, results, strict=True):
             people = base.find_people(result, choice)
             if not estimates:
                 ranks = evaluation.rank(people, choice)
@@ -672,8 +673,8 @@ def _compute_in_process(base: Analyses | Predictions, table: Sequence[Row], repo
     """Yield the result of each analysis, computed in this process."""
     with Interruption() as stop:
         for k, choice in enumerate(table):
-            stop.check()
             yield base.compute(choice, _OneAnalysis(stop, reporter, k, len(table)))
+            stop.check()
 
 
 @dataclass(frozen=True)

@@ -514,12 +514,12 @@ class AttentionAnalysis:
         done, count = 0, len(rays)
         with Interruption() as stop:
             for block in iter_blocks(rays, self.counting.rules):
-                stop.check()
                 yield count_block(block, context)
                 if on_block is not None:
                     on_block(block)
                 done += len(block)
                 self.reporter.progress(0.8 * done / count, f"{done:,} of {count:,} rays")
+                stop.check()
 
     def _place_viewpoints(self, num_viewpoints: int, observers: np.ndarray | None, grid: ObserverGrid) -> Viewpoints:
         """Return viewpoints without tracking."""

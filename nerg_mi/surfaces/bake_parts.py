@@ -395,10 +395,10 @@ def sum_directly(
         for group in parts:
             sums = baker.empty_sums
             for part in group:
-                stop.check()
                 sums = sums.add(baker.sums(part))
                 done += 1
                 reporter.progress(_BEGIN + (_END - _BEGIN) * done / count, f"part {done} of {count}")
+                stop.check()
             totals.append(sums)
     return totals
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 import nerg_mi as nerg
+from nerg_mi.aoi import robustness, statistics
 from nerg_mi.aoi.areas import Areas
 from nerg_mi.aoi.placed import open_placed_areas
 from nerg_mi.aoi.predicted import viewpoints_at
@@ -221,6 +223,32 @@ def test15_analyses_resume(tmp_path, rgb, monkeypatch, is_predicted):
     done = [int(text.split()[0]) for _, text in recorder.steps if " of 11 " in text]
     assert done[0] >= 4 and done[-1] == 11
     assert result.estimates == test().estimates
+
+
+def test21_ctrl_c_in_the_last_step_is_noticed(monkeypatch):
+    """Counting the only block of rays, and evaluating the last analysis."""
+    rays, calls = record(np.array([0.4, 0.3, 0.1, 0.2]), 2, count=4), []
+
+    def press(function, call):
+        def run(*arguments):
+            result = function(*arguments)
+            calls.append(result)
+            if len(calls) == call:
+                signal.raise_signal(signal.SIGINT)
+            return result
+
+        return run
+
+    evaluate = robustness.Evaluation.evaluate
+    for owner, name, function, call, analyse, options in (
+        (statistics, "count_block", statistics.count_block, 1, nerg.statistics, {}),
+        (robustness.Evaluation, "evaluate", evaluate, 11, nerg.robustness, {"analyses": 10}),
+    ):
+        calls.clear()
+        monkeypatch.setattr(owner, name, press(function, call))
+        with pytest.raises(KeyboardInterrupt):
+            analyse(rays, AREAS, **options)
+        assert len(calls) == call
 
 
 def test20_a_cluster_gives_the_same_tables(tmp_path, rgb, equal_processes):

@@ -8,6 +8,7 @@ import inspect
 import io
 import json
 import pickle
+import signal
 import struct
 from dataclasses import replace
 from importlib.resources import files
@@ -146,6 +147,20 @@ def test06_unused_outputs_are_not_computed(rgb, room, monkeypatch):
     bake(room, rays=rays(), max_edge=3.0).save(room.with_name("a.glb"))
     with pytest.raises(AssertionError):
         bake(room, rays=rays(), max_edge=3.0, smooth=0.1)
+
+
+def test09_ctrl_c_in_the_only_part_is_noticed(rgb, room, monkeypatch):
+    make_sums, calls = MeshBaker.sums, []
+
+    def press(*arguments):
+        calls.append(make_sums(*arguments))
+        signal.raise_signal(signal.SIGINT)
+        return calls[-1]
+
+    monkeypatch.setattr(MeshBaker, "sums", press)
+    with pytest.raises(KeyboardInterrupt):
+        bake(room, rays=rays(), max_edge=3.0)
+    assert len(calls) == 1
 
 
 def test07_a_mesh_in_millimetres_causes_a_warning(rgb, tmp_path):
