@@ -121,8 +121,8 @@ class RenderContext:
         offset = cast("Any", sampler).next_1d(active) if self.nerg.jitter else None
         return CameraView(self, scene, sensors, ray, active, offset, may_list)
 
-    def place(self, scene: mi.Scene, ray: Ray3f, surface: Sequence[Any]) -> CameraView:
-        """Rays without sensors, whose `CameraView.surface` was found before."""
+    def view_surface(self, scene: mi.Scene, ray: Ray3f, surface: Sequence[Any]) -> CameraView:
+        """Rays without sensors, whose `CameraView.surface` was computed before."""
         return CameraView(self, scene, [], ray, arrays.Bool(True), None, surface=surface)
 
     def list_inputs(

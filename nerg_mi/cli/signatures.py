@@ -99,6 +99,7 @@ def make_command(row: Row) -> Command:
     device |= {"mode": ("str | None", best_variant()) if row.fastest else ("str", llvm_variant())}
     members += [(name, *made) for name, made in device.items() if row.computes and name not in row.without]
     options = make_dataclass("Options", members, frozen=True, kw_only=True)
+    shown_names = {name for name, *_ in members}
 
     def run(*, options: Any, reporter: Reporter, **values: Any) -> None:
         paths = {name: path for name in outputs if (path := values.pop(name)) is not None}
@@ -157,7 +158,7 @@ def make_command(row: Row) -> Command:
         " ".join(summary.split()),
         " ".join(more.split()),
         options,
-        (*row.without, *(name for name in of_settings if name not in {name for name, *_ in members})),
+        (*row.without, *(name for name in of_settings if name not in shown_names)),
         arguments,
         readers.view_presets if readers else None,
     )

@@ -113,15 +113,15 @@ def describe_slow_sampling(rays: Rays, rules: EventRules) -> str:
 
 
 def explain_missing_fixations(rays: Rays, rules: EventRules, dispersion: float | None = None) -> str:
-    """Return why ``rays`` have no fixation by these limits, and the remedy, as part of a sentence."""
+    """Return that ``rays`` have no fixation by these limits, with the reason and the remedy."""
     if slow := describe_slow_sampling(rays, rules):
-        return f"{slow}: raise {parameter('max_step')}"
+        return f"no fixation was detected; {slow}: raise {parameter('max_step')}"
     name, limit = "velocity_threshold", f"below {rules.velocity_threshold:g} degrees per second"
     if dispersion is not None:
         name, limit = "dispersion_threshold", f"within {dispersion:g} degrees"
     return (
-        f"gaze never stays {limit} for {rules.min_fixation:g} s: raise {parameter(name)}, or lower "
-        f"{parameter('min_fixation')}"
+        f"no fixation was detected; gaze never stays {limit} for {rules.min_fixation:g} s: raise {parameter(name)}, or "
+        f"lower {parameter('min_fixation')}"
     )
 
 
@@ -136,8 +136,7 @@ def average_fixations(
     """
     rows = np.flatnonzero(label >= 0)
     if not rows.size:
-        reason = explain_missing_fixations(rays, rules or EventRules(), dispersion)
-        raise NergError(f"no fixation was detected; {reason}")
+        raise NergError(explain_missing_fixations(rays, rules or EventRules(), dispersion))
     _, index, number = np.unique(label[rows], return_index=True, return_inverse=True)
     n = np.bincount(number).astype(np.float64)
     mean = lambda v: np.stack([np.bincount(number, weights=c) for c in v[rows].T], axis=1) / n[:, None]

@@ -206,7 +206,7 @@ class _Step:
 
 
 class _Steps:
-    """Applies steps to rays one after the other. ``reason`` is why there are no fixations.
+    """Applies steps to rays one after the other. ``reason`` tells why there are no fixations.
 
     ``in_place`` tells whether the rays are not used elsewhere, so that they may be modified in place. ``reporter`` None
     is for one of several blocks: nothing is reported, and a step may select no ray.
@@ -233,7 +233,7 @@ class _Steps:
         if not self.fixations:
             self.reason = events.explain_missing_fixations(self.rays, rules, dispersion)
             if self._reporter is not None:
-                raise NergError(f"no fixation was detected; {self.reason}")
+                raise NergError(self.reason)
         if self._reporter is not None:
             self._reporter.message(f"{self.fixations:,} fixations ({selection.fixations})")
         settings = {"by": selection.fixations, **rules.describe(dispersion)}
@@ -317,7 +317,7 @@ class _Totals:
     def report(self) -> list[dict[str, Any]]:
         """Report and return the steps over all blocks. Raises `NergError` if nothing was selected."""
         if self._reason and not self._fixations:
-            raise NergError(f"no fixation was detected; {self._reason}")
+            raise NergError(self._reason)
         if not self._steps or not self._steps[-1].kept:
             raise NergError(f"none of {self._count:,} rays are selected; widen the conditions")
         # Conditions count all rays, many of which were not read.

@@ -260,7 +260,8 @@ def sensor_centers(sensors: Sequence[mi.Sensor]) -> list[Point3f]:
 
 
 def camera_cells(sensor: mi.Sensor) -> RayCells | None:
-    """The rays of ``sensor`` around its `sensor_center`, in cells of a few pixels; None for other kinds of sensors."""
+    """The rays of ``sensor`` around its `sensor_center`, in cells of a few pixels; None for other kinds of sensors, and
+    for a lens without an aperture or a distance in focus."""
     import mitsuba as mi
 
     kind, film, camera = kind_of_sensor(sensor), sensor.film(), cast("Any", sensor)

@@ -199,7 +199,7 @@ class _Frame:
             width, height = self.lattice.numbers[:2]
             pixel = dr.minimum(y, height - 1) * width + dr.minimum(x, width - 1)
             surface = [dr.gather(type(v), v, pixel) for v in surface]
-            return self.context.place(scene, ray, surface), []
+            return self.context.view_surface(scene, ray, surface), []
         sampler = make_sampler(1, self._key, self._first, num_rays)
         camera = self.context.trace(scene, [], sampler, ray, mi.Bool(True))
         return camera, (list(camera.compute_radiance(scene, sampler, None)[0]) * 3)[:3]
