@@ -21,7 +21,7 @@ from nerg_mi.fields.radiance import RadianceNetwork
 from nerg_mi.maths.types import variant_types
 from nerg_mi.transport.field_medium import FieldMedium
 from nerg_mi.transport.geometry import SURFACE_OPACITY
-from nerg_mi.transport.recording import Recorder, lists_all_arrays
+from nerg_mi.transport.recording import Recorder, must_sample_rays
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -467,7 +467,7 @@ class _Strip:
 def _render_strip(scene, sensor, layers: LayerSource, grid: _PixelGrid, strip: _Strip, blocks: list[Any]) -> None:
     """Trace a strip of samples, or replay it, and add it to ``blocks``, one per layer."""
     numbers, rays = strip.numbers, None
-    if layers.recorder is not None and not lists_all_arrays(sensor):
+    if layers.recorder is not None and layers.recorder.is_enabled and must_sample_rays(sensor):
         rays = _evaluate_rays(sensor, grid, strip)
         numbers = [*numbers, *rays]
 

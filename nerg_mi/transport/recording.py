@@ -232,14 +232,14 @@ def _get_callback_class(variant: str) -> type:
     return ParameterCallback
 
 
-# Of other cameras, Mitsuba 3.9.1 does not list all arrays.
 _LISTED_SENSORS = ("PerspectiveCamera", "Panorama")
-_OTHER_SENSORS = ("ThinLensCamera", "OrthographicCamera")
+# Of these, Mitsuba 3.9.1 does not list all arrays.
+_SAMPLED_SENSORS = ("ThinLensCamera", "OrthographicCamera")
 
 
-def lists_all_arrays(sensor: Any) -> bool:
-    """Whether a recording can sample rays of ``sensor``; those of others must be inputs."""
-    return kind_of_sensor(sensor) in _LISTED_SENSORS
+def must_sample_rays(sensor: Any) -> bool:
+    """Whether a recording cannot sample the rays of ``sensor``, which must be its inputs."""
+    return kind_of_sensor(sensor) in _SAMPLED_SENSORS
 
 
 def kind_of_sensor(sensor: Any) -> str:
@@ -254,7 +254,7 @@ def _list_sensor(state: State, sensor: Any) -> None:
     import mitsuba as mi
 
     kind = kind_of_sensor(sensor)
-    if kind not in _LISTED_SENSORS + _OTHER_SENSORS:
+    if kind not in _LISTED_SENSORS + _SAMPLED_SENSORS:
         raise NotRecordable(f"a sensor of the type {kind}")
     if sensor.get_medium() is not None:
         raise NotRecordable("a sensor inside a medium")

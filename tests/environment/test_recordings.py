@@ -638,8 +638,9 @@ def test20_lists_of_other_cameras_are_replayed(rgb, files, lens, count_traces, m
 @pytest.mark.parametrize("is_refused", [True, False])
 def test14_arrays_that_are_not_listed_are_traced(rgb, files, recwarn, monkeypatch, is_refused):
     """As may be the case for other plugins."""
-    kinds = "_OTHER_SENSORS", "_LISTED_SENSORS"
-    monkeypatch.setattr(recording, kinds[not is_refused], () if is_refused else ("ThinLensCamera",))
+    monkeypatch.setattr(recording, "_SAMPLED_SENSORS", ())
+    if not is_refused:
+        monkeypatch.setattr(recording, "_LISTED_SENSORS", ("ThinLensCamera",))
     scene = scene_with(rgb, with_field(files, aovs="depth"), camera(rgb, size=6, **LENSES["thinlens"]))
     for seed in range(4):
         assert np.array_equal(nerg.render_tensor(scene, seed=seed), rgb.render(scene, seed=seed))
