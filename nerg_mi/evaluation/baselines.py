@@ -430,7 +430,7 @@ def format_settings(baselines: Mapping[str, TunedBaseline]) -> str:
         for name, baseline in with_settings.items()
     ]
     if all(baseline.folds for baseline in with_settings.values()):
-        source = "tuned on folds of the training rays"
+        source = "tuned on folds of the training rays, with or without zones of positions, whichever is better here"
     else:
         source = "not tuned, because there are too few training rays for folds"
     return f"Settings of the baselines, {source}: {'; '.join(parts)}."

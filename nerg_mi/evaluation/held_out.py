@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -45,7 +45,7 @@ from .baselines import (
 from .baselines import PRIOR as PRIOR_BASELINE
 from .gaze import EPS, SCORES, SPLIT_HALF, FieldDensity
 from .gaze_report import compute_verdict, draw_comparison, explain_missing, write_report
-from .position_scores import AWAY, RECORDED, format_verdicts, iter_region_levels, score_kinds
+from .position_scores import choose_tunings, format_verdicts, iter_region_levels, score_kinds
 from .uncertainty import correlate_uncertainty, measure_calibration, measure_coverage, score_positions
 
 _FIELD = "gaze field"  # Name of the method that is compared with the baselines
@@ -229,8 +229,8 @@ def evaluate_gaze(
         hits = find_hit_points(train, opened)
         # All baselines that are tuned here have the same prior.
         prior_kappa = prior_kappa or select_prior_kappa(train, "person", seed)
-        tune = partial(make_tuned_baselines, train, account["radius"], hits, prior_kappa=prior_kappa, seed=seed)
-        baselines = tune(participants=split != "pos", positions=split != "people")
+        tunings = _tune_baselines(train, account["radius"], hits, prior_kappa, split, seed)
+        baselines = choose_tunings(tunings, test.own_origins, test.own_directions, test.own_participants)
         depth, count = training.get("probes", {}).get("depth", "median"), len(test.centres)
         # Much of the time is spent on evaluating the field.
         report_position = lambda number: reporter.progress(
@@ -241,7 +241,7 @@ def evaluate_gaze(
             FieldDensity(loaded.network, opened.medium, opened.align, depth, report_position).members
         )
         field_density = lambda positions, directions: members(positions, directions).mean(axis=0)
-        methods = {_FIELD: field_density, **{name: CachedBaseline(b.density) for name, b in baselines.items()}}
+        methods = {_FIELD: field_density, **{name: b.density for name, b in baselines.items()}}
         prior = methods[PRIOR_BASELINE]
         reporter.progress(0.05, "scores")
         report_share = lambda share: reporter.progress(0.4 + 0.45 * share, "scores") if share > 0 else None
@@ -255,7 +255,7 @@ def evaluate_gaze(
         reporter.progress(0.85, "recorded and new positions")
         density = FieldDensity(loaded.network, opened.medium, opened.align, depth)
         held_out = _select_all_held_out(data, account)
-        verdicts = _score_kinds(train, held_out, account, split, density, baselines, tune, seed)
+        verdicts = score_kinds(train, held_out, density, tunings, seed)
         reporter.progress(0.88, "participants")
         select = lambda names: {name: methods[name] for name in names if name in methods}
         persons = evaluation.score_participants(test, select(_BY_PERSON), prior, min_rays)
@@ -316,26 +316,19 @@ def _select_all_held_out(rays: Rays, account: dict) -> Rays:
     return rays.select(~purge(rays, np.array(account["centres"]), account["radius"]))
 
 
-def _score_kinds(
-    train: Rays,
-    held_out: Rays,
-    account: dict,
-    split: str,
-    density: Baseline,
-    baselines: Mapping[str, TunedBaseline],
-    tune: Callable[..., Mapping[str, TunedBaseline]],
-    seed: int,
-) -> list[dict[str, Any]]:
-    """Score the field at recorded positions and away from them. The ``baselines`` are those tuned for the ``split``,
-    and ``tune`` makes others."""
-    tuned_for = {"people": RECORDED, "both": AWAY}.get(split)
-
-    def tune_for(kind: str) -> dict[str, Baseline]:
-        if kind == tuned_for or not account.get("people"):
-            return {name: baseline.density for name, baseline in baselines.items()}
-        return {name: b.density for name, b in tune(participants=True, positions=kind == AWAY).items()}
-
-    return score_kinds(train, held_out, density, tune_for, seed)
+def _tune_baselines(
+    train: Rays, radius: float, hits: np.ndarray | None, prior_kappa: float, split: str, seed: int
+) -> list[dict[str, TunedBaseline]]:
+    """Tune the baselines in folds that hold out what the ``split`` does, and in others: without zones of positions, or
+    with them if the split has none."""
+    of_split = {"participants": split != "pos", "positions": split != "people"}
+    others = {"participants": True, "positions": split == "people"}
+    tune = partial(make_tuned_baselines, train, radius, hits, prior_kappa=prior_kappa, seed=seed)
+    # All tables use the same densities.
+    return [
+        {name: replace(tuned, density=CachedBaseline(tuned.density)) for name, tuned in tune(**kind).items()}
+        for kind in (of_split, others)
+    ]
 
 
 def _report(gaze: GazeField, result: GazeEvaluation, reporter: Reporter) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from nerg_mi.tracking.probes import compute_region_levels
 from nerg_mi.tracking.rays import Rays
 from nerg_mi.train.gaze_data import make_rotated_directions
 
-from .baselines import PRIOR, Baseline
+from .baselines import PRIOR, Baseline, TunedBaseline
 
 RECORDED, AWAY = "recorded positions", "new positions"
 """Kinds of positions: up to `NEW_POSITION_DISTANCE` from the nearest training ray, and farther away from all."""
@@ -44,8 +44,30 @@ def iter_region_levels(
         yield kind, compute_region_levels(density[:, :-1], density[:, -1:])[:, 0], rays
 
 
+def choose_tunings(
+    tunings: Sequence[Mapping[str, TunedBaseline]], origins: np.ndarray, directions: np.ndarray, person: np.ndarray
+) -> dict[str, TunedBaseline]:
+    """Return each baseline with the settings that are best at the scored rays, so that no field is better only because
+    the folds of a baseline differ from the test.
+
+    Parameters
+    ----------
+    tunings : sequence of mapping
+        The same baselines, by name, with settings of several kinds of folds.
+    origins : numpy.ndarray
+        Origins (n, 3) of the scored rays in metres.
+    directions : numpy.ndarray
+        Their unit directions (n, 1, 3).
+    person : numpy.ndarray
+        Indices (n,) of their participants, who have equal weights.
+    """
+    weights = 1 / np.bincount(person)[person]
+    score = lambda baseline: weights @ _log_bits(baseline.density(origins, directions)[:, 0])
+    return {name: max((tuning[name] for tuning in tunings), key=score) for name in tunings[0]}
+
+
 def score_kinds(
-    train: Rays, held_out: Rays, field: Baseline, tune: Callable[[str], Mapping[str, Baseline]], seed: int = 0
+    train: Rays, held_out: Rays, field: Baseline, tunings: Sequence[Mapping[str, TunedBaseline]], seed: int = 0
 ) -> list[dict[str, Any]]:
     """Score a field and baselines on ``held_out`` rays at both kinds of positions, each ray at its own origin.
 
@@ -55,8 +77,8 @@ def score_kinds(
         Training rays, and rays of others.
     field : Baseline
         Density of the gaze field.
-    tune : callable
-        Returns the baselines, with `PRIOR` among them, that are tuned for a kind of positions.
+    tunings : sequence of mapping
+        Baselines, with `PRIOR` among them, with settings of several kinds of folds (`choose_tunings`).
     seed : int
         Seed of the drawn rays.
 
@@ -70,7 +92,8 @@ def score_kinds(
     rows = []
     for kind, rays in iter_kinds(train, held_out, _MAX_RAYS, seed):
         # The same arrays for all, so that baselines which share a density evaluate it once.
-        baselines, at = tune(kind), (rays.origin, rays.direction[:, None])
+        at = rays.origin, rays.direction[:, None]
+        baselines = {name: tuned.density for name, tuned in choose_tunings(tunings, *at, rays.person).items()}
         evaluate = lambda method, at=at: _log_bits(method(*at)[:, 0])
         prior = evaluate(baselines[PRIOR])
         gains = {name: evaluate(method) - prior for name, method in {"gaze field": field, **baselines}.items()}

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nerg_mi.evaluation.baselines import PRIOR
+from nerg_mi.evaluation.baselines import PRIOR, TunedBaseline
 from nerg_mi.evaluation.position_scores import (
     AWAY,
     RECORDED,
+    choose_tunings,
     find_best,
     format_verdicts,
     iter_region_levels,
@@ -32,7 +33,14 @@ def constant(density: float):
     return lambda positions, directions: np.full((len(positions), directions.shape[-2]), density)
 
 
-def test_each_kind_has_baselines_of_its_own():
+def tuning(**densities) -> dict[str, TunedBaseline]:
+    """Baselines by name; the prior has a density of 0.05 1/sr unless another is named."""
+    methods = {PRIOR: constant(0.05), **densities}
+    return {name: TunedBaseline(method) for name, method in methods.items()}
+
+
+def test_each_kind_has_the_better_settings_of_a_baseline():
+    """Settings of both kinds of folds compete at both kinds of positions."""
     train = people(3, 50, 0.0)
     near, far = people(4, 40, 0.0), people(4, 40, 2.0)
     held_out = Rays(
@@ -45,12 +53,14 @@ def test_each_kind_has_baselines_of_its_own():
     )
     # Half as good where nobody stood
     field = lambda positions, directions: np.where(positions[:, :1] > 1, 0.2, 0.4)
-    tuned = {RECORDED: 0.2, AWAY: 0.1}
-    tune = lambda kind: {PRIOR: constant(0.05), "good": constant(tuned[kind]), "bad": constant(0.01)}
-    rows = score_kinds(train, held_out, field, tune)
+    near_only = lambda positions, directions: np.where(positions[:, :1] > 1, 0.01, 0.2)
+    tunings = [tuning(good=constant(0.1), bad=constant(0.01)), tuning(good=near_only, bad=constant(0.005))]
+    rows = score_kinds(train, held_out, field, tunings)
+    assert rows == score_kinds(train, held_out, field, tunings[::-1])
     assert [(row["kind"], row["method"]) for row in rows] == [
         (kind, name) for kind in (RECORDED, AWAY) for name in ("gaze field", "good", PRIOR, "bad")
     ]
+    assert rows[3]["bits"] == pytest.approx(np.log2(0.01 / 0.05))
     for kind in (RECORDED, AWAY):
         best = find_best(rows, kind)
         assert best is not None and best["method"] == "good" and best["people"] == 4 and best["rays"] == 160
@@ -62,20 +72,29 @@ def test_each_kind_has_baselines_of_its_own():
     assert all("no interval" in line for line in format_verdicts(alone))
 
 
+def test_people_have_equal_weights_in_the_choice_of_settings():
+    """One of two participants has most of the rays; the settings that are best for her alone are not chosen."""
+    origin, direction = np.zeros((10, 3)), np.tile([0, 0, 1.0], (10, 1, 1))
+    person = np.array([0] * 9 + [1])
+    of_many = lambda positions, directions: np.where(person == 0, 0.2, 0.001)[:, None]
+    tunings = [tuning(method=of_many), tuning(method=constant(0.1))]
+    assert choose_tunings(tunings, origin, direction, person)["method"] is tunings[1]["method"]
+    of_one = choose_tunings(tunings, origin, direction, np.zeros(10, int))
+    assert of_one["method"] is tunings[0]["method"]
+
+
 def test_intervals_are_those_of_participants():
     train, held_out = people(2, 30, 0.0), people(3, 30, 0.0)
     # The participants' own densities differ; the origins tell who it is.
     of_person = {tuple(o): 0.1 * 2.0**p for o, p in zip(held_out.origin, held_out.person)}
     field = lambda positions, directions: np.array([[of_person[tuple(p)]] for p in positions])
-    rows = score_kinds(train, held_out, field, lambda kind: {PRIOR: constant(0.1)})
+    rows = score_kinds(train, held_out, field, [{PRIOR: TunedBaseline(constant(0.1))}])
     assert find_best(rows, AWAY) is None and len(rows) == 2
     assert rows[0]["bits"] == pytest.approx(1)
     # 0, 1 and 2 bits: a standard error of 1/sqrt(3), times 4.30 of Student's t
     assert rows[0]["bits.high"] - rows[0]["bits"] == pytest.approx(4.3027 / np.sqrt(3), rel=1e-3)
     # Two participants have no interval.
-    assert (
-        "bits.low" not in score_kinds(train, people(2, 30, 0.0), constant(0.1), lambda kind: {PRIOR: constant(0.1)})[0]
-    )
+    assert "bits.low" not in score_kinds(train, people(2, 30, 0.0), constant(0.1), [tuning()])[0]
 
 
 def test_levels_of_regions_are_those_of_each_ray_at_its_origin():
