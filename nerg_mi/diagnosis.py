@@ -128,7 +128,7 @@ def run_diagnosis(progress: Progress = None) -> Diagnosis:
     add(Finding("versions", versions, problem))
 
     library, llvm_problem = llvm.find_current(), llvm.find_problem()
-    add(Finding("libLLVM", str(library) if library else "none", llvm_problem or llvm.find_slowness()))
+    add(Finding("libLLVM", str(library) if library else "none", llvm_problem or ""))
     # The scalar variants need no backend. They are tested first because Mitsuba itself may be broken.
     results = {"scalar": try_backend("scalar")}
     results["llvm"] = try_backend("llvm") if llvm_problem is None else {"variants": [], "failed": {}}

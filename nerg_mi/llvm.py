@@ -22,12 +22,6 @@ from nerg_mi.errors import UnusableLLVM
 MIN_VERSION = 17
 """Oldest major version of LLVM whose code generator supports all operations that Dr.Jit emits."""
 
-SLOW_VERSIONS = (21, 22)
-"""Major versions that are chosen last: one file, which LLVM 20 compiles in 2.5 s, takes them 1.5 minutes.
-
-https://github.com/llvm/llvm-project/issues/194308; none of them was measured here.
-"""
-
 PATH_VARIABLE = "DRJIT_LIBLLVM_PATH"
 """Environment variable with the path of the library for Dr.Jit. A value set by the user is never replaced."""
 
@@ -76,10 +70,6 @@ class Library(NamedTuple):
     def is_usable(self) -> bool:
         return self.version[0] >= MIN_VERSION
 
-    @property
-    def is_slow(self) -> bool:
-        return self.version[0] in SLOW_VERSIONS
-
     def __str__(self) -> str:
         number = ".".join(map(str, self.version))
         return f"LLVM {number} ({self.path})" if self.path else f"LLVM {number}"
@@ -122,7 +112,8 @@ def find_version(path: str) -> tuple[int, ...] | None:
 def find_installed() -> list[Library]:
     """Return each libLLVM in the usual library folders, best first, without duplicates.
 
-    The best one is usable, not one of `SLOW_VERSIONS`, and the newest of these.
+    The best one is the newest, if it is usable: LLVM 19, 21, 22 and 23 compile the kernels of frames and of trainings
+    equally fast.
     """
     folders = [*_FOLDERS.get(sys.platform, ()), os.path.join(sys.prefix, "lib")]
     suffix = "*.dylib" if sys.platform == "darwin" else "*.so*"
@@ -135,7 +126,7 @@ def find_installed() -> list[Library]:
             version = find_version(real)
             if version is not None:
                 libraries[real] = Library(path, version)
-    return sorted(libraries.values(), key=lambda one: (one.is_usable, not one.is_slow, one.version), reverse=True)
+    return sorted(libraries.values(), key=lambda one: (one.is_usable, one.version), reverse=True)
 
 
 def has_cuda() -> bool:
@@ -198,21 +189,6 @@ def find_problem() -> str | None:
     if user_path is not None:
         return f'{PATH_VARIABLE} names "{user_path}", which is not a usable libLLVM: {suggest_fix()}.'
     return f"No libLLVM was found, and the llvm variants need version {MIN_VERSION} or newer: {suggest_fix()}."
-
-
-def find_slowness() -> str:
-    """Return why the libLLVM of Dr.Jit can be slow, as one sentence with the remedy; "" if it is none of
-    `SLOW_VERSIONS`."""
-    library = find_current()
-    if library is None or not library.is_slow:
-        return ""
-    best = next(iter(find_installed()), library)
-    remedy = "install LLVM 19" if sys.platform == "win32" else '"brew install llvm@19"'
-    if PATH_VARIABLE in os.environ and best.is_usable and not best.is_slow:
-        remedy = f"unset {PATH_VARIABLE}, since {best} is installed"
-    elif sys.platform == "linux":
-        remedy = '"sudo apt install libllvm19"'
-    return f"{library} is reported to compile some programs 30 times more slowly than LLVM 20: {remedy}."
 
 
 def require_usable(variant: str | None = None) -> None:
