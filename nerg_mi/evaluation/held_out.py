@@ -150,9 +150,10 @@ def evaluate_gaze(
     """Score a gaze field on held-out data and compare it with baselines: uniform, position-independent, nearest rays,
     conditional kernel density, re-aimed hits, a stack of kernels, and the other half of the participants.
 
-    The held-out data chose nothing of the field, and the baselines are tuned on folds of the training rays. An
-    alignment that nerg align fitted to hit points or traces of gaze used the rays of all participants, and the defaults
-    of the recipe were chosen in other trainings, some of them in public recordings.
+    The held-out data chose nothing of the field. The baselines are tuned on folds of the training rays, with zones of
+    positions left out and without, and the better of the two is scored, which favours the baselines. An alignment that
+    nerg align fitted to hit points or traces of gaze used the rays of all participants, and the defaults of the recipe
+    were chosen in other trainings, some of them in public recordings.
 
     Parameters
     ----------
