@@ -110,10 +110,9 @@ def find_version(path: str) -> tuple[int, ...] | None:
 
 
 def find_installed() -> list[Library]:
-    """Return each libLLVM in the usual library folders, best first, without duplicates.
+    """Return each libLLVM in the usual library folders, newest first, without duplicates.
 
-    The best one is the newest, if it is usable: LLVM 19, 21, 22 and 23 compile the kernels of frames and of trainings
-    equally fast.
+    LLVM 19, 21, 22 and 23 compile the kernels of frames and of trainings equally fast.
     """
     folders = [*_FOLDERS.get(sys.platform, ()), os.path.join(sys.prefix, "lib")]
     suffix = "*.dylib" if sys.platform == "darwin" else "*.so*"
@@ -126,7 +125,7 @@ def find_installed() -> list[Library]:
             version = find_version(real)
             if version is not None:
                 libraries[real] = Library(path, version)
-    return sorted(libraries.values(), key=lambda one: (one.is_usable, one.version), reverse=True)
+    return sorted(libraries.values(), key=lambda one: one.version, reverse=True)
 
 
 def has_cuda() -> bool:
@@ -142,7 +141,7 @@ def has_cuda() -> bool:
 
 
 def select_library() -> None:
-    """Set the environment so that Dr.Jit loads the best usable libLLVM.
+    """Set the environment so that Dr.Jit loads the newest libLLVM, if it is usable.
 
     Does nothing if the user has set the variable or Dr.Jit is already loaded.
     """

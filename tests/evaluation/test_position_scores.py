@@ -34,7 +34,7 @@ def constant(density: float):
 
 
 def tuning(**densities) -> dict[str, TunedBaseline]:
-    """Baselines by name; the prior has a density of 0.05 1/sr unless another is named."""
+    """Baselines by name, and a prior of 0.05 1/sr."""
     methods = {PRIOR: constant(0.05), **densities}
     return {name: TunedBaseline(method) for name, method in methods.items()}
 
